@@ -126,7 +126,7 @@ _Mode = Literal["off", "measured", "fixed"]
 
 
 class CompensationSettings(BaseModel):
-    """Over which delay the state is predicted: see controller/native/br_delay.c.
+    """Over which delay the state is predicted: see controller/native/br_state.c.
 
     Also by a text: the mode, or milliseconds of a fixed delay.
     """

@@ -58,7 +58,7 @@ CYCLES: Final = "run state_seq fallback sensor_fault"
 
 _DOUBTFUL: Final = 16
 """States up to one that is not believed which may be wrong as well: the controller looks back as
-far (controller/native/br_monitor.c)."""
+far (controller/native/br_state.c)."""
 
 MAX_BYTES: Final = 1 << 30
 """Upper limit of an array file's unpacked size; larger ones are refused before they are read."""

@@ -101,9 +101,9 @@ def no_input_breaks_a_promise(objects: dict[str, Path], tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("file", "guard", "without"),
     [
-        ("br_prepare", "if (shifts < mpc->ahead)", "if (0)"),
+        ("br_step", "if (shifts < mpc->ahead)", "if (0)"),
         ("br_planner", "spacing >= BR_PATH_SPACING_MIN_M", "spacing > 0"),
-        ("br_predict", "return BR_ERROR_STATE;\n    memcpy", "{}\n    memcpy"),
+        ("br_stage", "return BR_ERROR_STATE;\n    memcpy", "{}\n    memcpy"),
     ],
     ids=["too far ahead", "tiny spacing", "not plausible"],
 )

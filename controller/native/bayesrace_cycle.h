@@ -44,7 +44,7 @@ typedef enum {
     BR_STOP          /* standing still */
 } br_level;
 
-/* Why a measured state is not believed: see br_monitor.c and br_cycle_fault_text. */
+/* Why a measured state is not believed: see br_state.c and br_cycle_fault_text. */
 typedef enum {
     BR_FAULT_NONE = 0,
     BR_FAULT_FROZEN,
@@ -109,7 +109,7 @@ typedef struct {
     REAL(delay_s)          /* the fixed one */                                         \
     REAL(longest_s)        /* no prediction goes farther */                            \
     REAL(stale_s)          /* age from which a state is fallen back from */            \
-    REAL(sensor_tolerance) /* multiple of the bounds of br_monitor.c; 0: no monitor */
+    REAL(sensor_tolerance) /* multiple of the bounds of br_state.c; 0: no monitor */
 
 typedef struct {
     double u_low[BR_NU];  /* what no input is below */
@@ -213,7 +213,7 @@ BR_API br_mpc_error br_cycle_set_driving(br_cycle *cycle, const br_driving *sett
  * controller; NULL for none. */
 BR_API br_mpc_error br_cycle_set_clock(br_cycle *cycle, br_mpc_clock clock, void *context);
 
-/* A state has arrived. One that contradicts those before it (br_monitor.c) counts with what the
+/* A state has arrived. One that contradicts those before it (br_state.c) counts with what the
  * model predicts in place of what it says; after settings.stale_s the car brakes along the line, by
  * that prediction, and drives on once states agree with it again. A run is one stream of states:
  * one plant (epoch), one run number, rising numbers. Another stream is followed once the run has

@@ -235,7 +235,7 @@ BR_API void br_mpc_reset(br_mpc *mpc);
 /* One control step: projects the car on the racing line, makes the reference, solves, checks.
  * A problem without a path has none of that (BR_ERROR_NOT_READY): br_mpc_solve serves it.
  * Where the car stands and points away from the line, the reference (br_mpc_get_reference) leads it
- * round at a walking pace instead, with the track's edges farther out: see br_turnaround.c.
+ * round at a walking pace instead, with the track's edges farther out: see br_planner.c.
  *
  * x: measured state. u_before: the input that acts now. u: first input of the plan; written
  * only for BR_CONVERGED and BR_ACCEPTABLE. info may be NULL.

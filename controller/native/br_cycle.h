@@ -6,7 +6,7 @@
 
 #define STAGE_ROUNDING 1e-6 /* share of a stage: times that are added up differ by so much */
 
-/* --- br_stream.c: which states count --- */
+/* --- br_state.c: which states count --- */
 
 typedef struct {
     br_measured newest, other; /* other: the last one that did not continue the stream */
@@ -19,7 +19,7 @@ void br_stream_init(br_stream *stream);
 br_reception br_stream_accept(br_stream *stream, const br_measured *state, br_counters *counters);
 int br_stream_forget(br_stream *stream, br_counters *counters);
 
-/* --- br_delay.c: the state at the moment from which the new input will act --- */
+/* --- br_state.c: the state at the moment from which the new input will act --- */
 
 #define BR_SENT 1024    /* inputs remembered: two seconds at 500 Hz */
 #define BR_MEDIAN_OF 15 /* delays */
@@ -61,7 +61,7 @@ void br_fallback_plan(const br_fallback *fallback, const br_driving *settings, d
 void br_fallback_brake_to(const br_driving *settings, double vx_mps, double delta_rad,
                           double angle_rad, double duration_s, double u[BR_NU]);
 
-/* --- br_monitor.c: whether a measured state can be believed --- */
+/* --- br_state.c: whether a measured state can be believed --- */
 
 #define BR_BELIEVED 16
 

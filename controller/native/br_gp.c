@@ -20,10 +20,7 @@
  * br_gp_evaluate keeps the weights of the second derivatives, br_gp_curvature makes their sums when
  * and if they are needed.
  */
-#include <math.h>
-
 #include "br_internal.h"
-#include "br_kernel.h"
 
 #define INLINE static inline __attribute__((always_inline))
 

@@ -3,20 +3,12 @@
 #define BR_INTERNAL_H
 
 #include <daqp/types.h>
+#include <math.h>
 #include <stdatomic.h>
 
 #define BR_TABLES /* the sparsity of the problem, too */
 #include "bayesrace_mpc.h"
-#include "br_code.h"
-#include "br_vector.h"
-
-/* Before loops over states, inputs, rows and their nonzeros, which have constant bounds: unrolled,
- * the problem's sparsity is in the code, and no table is read. */
-#ifdef __clang__
-#define BR_UNROLL _Pragma("unroll")
-#else
-#define BR_UNROLL _Pragma("GCC unroll 16")
-#endif
+#include "br_kernel.h"
 
 /* Inputs that a QP changes alike make a block: each of the first BR_FREE stages is one, and of the
  * stages after them each BR_BLOCK. */
@@ -33,45 +25,6 @@
 #define BR_LINE_SEARCH_TRIALS 5
 #define BR_FUTILE 8 /* second starts in vain from which they are made only each so many steps */
 #define BR_DEFECT_FINE 0.01 /* of BR_STATE_SCALE: not worth another iteration */
-#define BR_GP_BLOCK 128     /* training points that are taken at a time: in the first-level cache */
-#define BR_GP_BLOCKS ((BR_GP_CAPACITY + BR_GP_BLOCK - 1) / BR_GP_BLOCK)
-#define BR_GP_PADDED (BR_GP_BLOCKS * BR_GP_BLOCK)
-/* Training points that the posterior variance is exact with: the memory for it grows with the
- * square. */
-#define BR_GP_ROOT (BR_GP_CAPACITY < 512 ? (BR_GP_CAPACITY + 7) / 8 * 8 : 512)
-#define BR_ROOT_TILE 8 /* rows of a triangular matrix that are stored together */
-#define BR_ROOT_SIZE(n) \
-    ((n) * ((n) + BR_ROOT_TILE) / 2)      /* numbers of n rows, whole tiles of them */
-#define BR_COLUMNS 8                      /* stages whose correlations are at hand at a time */
-#define BR_GP_FIRST ((1 + BR_NZ + 7) / 8) /* groups of eight columns for 1 and the inputs ... */
-#define BR_GP_SECOND ((BR_NZ * (BR_NZ + 1) / 2 + 7) / 8) /* ... and for their products */
-
-/* One output of the residual as the kernel wants it: scaled features, structure of arrays. */
-typedef struct {
-    int kernel, n_padded;
-    double offset;
-    double inverse_scale[BR_NZ], middle[BR_NZ]; /* z * inverse_scale - middle is what is in ... */
-    double reach;                               /* length of the longest input */
-    BR_ALIGNED double inputs[BR_NZ][BR_GP_PADDED];
-    BR_ALIGNED double alpha[BR_GP_PADDED];   /* signal scale folded in */
-    BR_ALIGNED double squares[BR_GP_PADDED]; /* of the length of the inputs, times -log2(e) / 2 */
-    BR_ALIGNED double columns[BR_GP_FIRST + BR_GP_SECOND][BR_GP_PADDED][8];
-} br_gp_output;
-
-/* What the posterior variance of one output is made from: see br_variance.c. */
-typedef struct {
-    int kernel, count;    /* training points that count */
-    double signal, noise; /* variances; signal 0: not known */
-    double inputs[BR_NZ][BR_GP_ROOT];
-    BR_ALIGNED double root[BR_ROOT_SIZE(BR_GP_ROOT)];
-} br_gp_variance;
-
-typedef struct br_gp {
-    int any; /* 0 while every output is constant zero: WorstCase and BestCase skip the kernels */
-    int uncertain; /* the variance of an output is known */
-    br_gp_output output[BR_NE];
-    br_gp_variance variance[BR_NE];
-} br_gp;
 
 /* Cost and constraints of one stage, at the state of its end: br_terms writes this. */
 typedef struct {
@@ -86,15 +39,6 @@ typedef struct {
     double cost_xx[BR_CXX_NNZ + 1], rows_xx[BR_RXX_NNZ + 1]; /* by BR_CXX_ROW and so on */
     double uu[2 * BR_NU][2 * BR_NU];                         /* of [u; u_before] */
 } br_stage_curvature;
-
-/* Weights of one block of training points. */
-typedef double br_gp_row[BR_GP_BLOCK];
-
-/* The residual at one stage. */
-typedef struct {
-    double mean[BR_NE], gradient[BR_NE][BR_NZ];
-    double sums[BR_NE][8 * BR_GP_FIRST]; /* for br_gp_curvature */
-} br_correction;
 
 /* Linearisation of the corrected model at one stage. */
 typedef struct {
@@ -115,14 +59,6 @@ typedef struct {
     double speed_limit, speed_limit_rate; /* of the environment */
     double age;                           /* time since then */
 } br_path;
-
-/* Where a state is beside the line. */
-typedef struct {
-    double left_m;    /* of the line */
-    double middle_m;  /* of the track, to the left of the line */
-    double outside_m; /* of the track less its margin; negative inside */
-    double speed_mps; /* of the line */
-} br_beside;
 
 typedef struct {
     int regularised;  /* the exact Hessian was not positive definite */
@@ -194,7 +130,7 @@ typedef struct {
     br_judged judged[BR_WATCHED]; /* the newest */
 } br_watch;
 
-/* Of each output, by how many standard deviations the residual errs: see br_caution.c. */
+/* Of each output, by how many standard deviations the residual errs: see br_watch.c. */
 typedef struct {
     double recent[BR_NE], held[BR_NE]; /* mean of the newest; the largest, slowly forgotten */
 } br_misfit;
@@ -236,6 +172,26 @@ typedef enum {
     BR_LINEARISATION, /* stage[]: of the plan and the weights in use */
     BR_RESULTS
 } br_result;
+
+/* The functions of the interface that take time, as one code has them. */
+typedef struct {
+    __typeof__(br_mpc_step) *step;
+    __typeof__(br_mpc_solve) *solve;
+    __typeof__(br_mpc_prepare) *prepare;
+    __typeof__(br_mpc_rehearse) *rehearse;
+    __typeof__(br_mpc_predict) *predict;
+#if BR_HAS_PATH
+    __typeof__(br_mpc_steer) *steer;
+#endif
+    __typeof__(br_mpc_variance) *variance;
+    __typeof__(br_mpc_evaluate) *evaluate;
+    br_mpc_error (*load)(br_gp *gp, const br_mpc_gp outputs[BR_NE]);
+} br_code;
+
+extern const br_code br_code_baseline;
+#if defined(__x86_64__)
+extern const br_code br_code_avx2, br_code_avx512;
+#endif
 
 /* The spare one of the weight buffers, and whose it is. */
 enum {
@@ -305,53 +261,79 @@ static inline void br_invalidate(br_mpc *mpc, br_result result) {
     memset(mpc->valid, 0, result + 1);
 }
 
-/* br_gp.c */
-/* Mean and gradient of several stages, at most BR_N. Their weights for br_gp_curvature go into
- * kept, which has room for those of so many stages: (output, block, stage), row by row. */
-BR_PART void br_gp_evaluate(const br_gp *gp, int stages, double (*z)[BR_NZ], br_gp_row *kept,
-                            int room, br_correction *out);
-/* Of all stages that kept has room for, out[s] = sum_j weight[s][j] d^2 mu_j / d z^2. */
-BR_PART void br_gp_curvature(const br_gp *gp, int stages, double (*z)[BR_NZ], br_gp_row *kept,
-                             const br_correction *const values[], double (*weight)[BR_NE],
-                             double (*out)[BR_NZ][BR_NZ]);
-BR_PART void br_gp_clear(br_gp *gp);
-BR_PART void br_gp_mean(const br_gp *gp, const double z[BR_NZ], double mean[BR_NE]);
-BR_PART br_mpc_error br_gp_load(br_gp *gp, const br_mpc_gp outputs[BR_NE]);
+/* --- what all parts need --- */
 
-/* br_watch.c */
-BR_PART void br_watch_update(br_mpc *mpc); /* in the preparation */
+/* The larger one, and NaN if either is: fmax would lose a NaN and with it a bad solution. */
+static inline double br_worse(double a, double b) { return b > a || b != b ? b : a; }
 
-/* br_variance.c */
-/* Of one output whose weights are loaded. */
-BR_PART void br_variance_load(const br_gp_output *gp, const br_mpc_gp *in, br_gp_variance *v);
-/* Noise included, of several stages; 0 where it is not known. */
-BR_PART void br_gp_variances(const br_gp *gp, int stages, double (*z)[BR_NZ],
-                             double (*work)[BR_COLUMNS], double (*variance)[BR_NE]);
+static inline int br_usable(br_mpc_status status) { return status <= BR_ACCEPTABLE; }
 
-/* br_caution.c */
-BR_PART void br_caution_reset(br_caution *caution);
-BR_PART void br_caution_update(br_mpc *mpc);
-BR_PART void br_caution_tighten(br_mpc *mpc, int k, br_stage_terms *terms);
-BR_PART void br_caution_pace(br_mpc *mpc, double elapsed);
-BR_PART void br_caution_report(br_mpc *mpc); /* into mpc->info */
+static inline int br_all_finite(const double *values, int n) {
+    double sum = 0; /* 0 * inf and 0 * nan are nan */
+    for (int i = 0; i < n; ++i) sum += 0.0 * values[i];
+    return sum == 0.0;
+}
 
-/* br_caution.c: against what the car does */
-BR_PART void br_innovation_reset(br_innovation *innovation);
-/* A step has been made: what was observed before it is due. */
-BR_PART void br_innovation_advance(br_innovation *innovation);
-/* By what the standard deviations of the output are to be multiplied. */
-BR_PART int br_most_changed(const br_stage *stage, int output); /* state, by this output */
-BR_PART double br_innovation_widening(const br_innovation *innovation, int output);
-BR_PART int br_innovation_due(const br_innovation *innovation);
-/* As if what is due had not been judged: parameters or code are others now. */
-BR_PART void br_innovation_undo(br_innovation *innovation);
-/* What is due, by the variance of the residual there; the plan is linearised. */
-BR_PART void br_innovation_judge(br_mpc *mpc, const double variance[BR_NE]);
+/* Whether each number is at most as large as its limit, BR_STATE_LIMIT or BR_INPUT_LIMIT. */
+static inline int br_plausible(const double *values, const double *limit, int n) {
+    for (int i = 0; i < n; ++i)
+        if (!(fabs(values[i]) <= limit[i])) return 0;
+    return 1;
+}
 
-/* br_weights.c */
-void br_weights_init(br_mpc *mpc);
+static inline int br_plausible_state(const double x[BR_NX]) {
+    return br_plausible(x, BR_STATE_LIMIT, BR_NX);
+}
 
-/* br_planner.c */
+static inline const double *br_theta(const br_mpc_parameters *parameters) {
+    return (const double *)parameters; /* the problem's come first, all of them doubles */
+}
+
+/* Whether the stage is the first of its block. */
+static inline int br_opens_block(int k) { return k == 0 || BR_BLOCK_OF(k) > BR_BLOCK_OF(k - 1); }
+
+/* Whole vectors that cover columns 0..n-1 of a BR_MP-wide row; the rest of a row is zero. */
+static inline int br_padded(int n) { return (n + 7) & ~7; }
+
+/* 0 without a clock; its time is measured with and without a budget, so that br_mpc_prepare knows
+ * what an iteration takes. */
+static inline double br_timer_now(const br_timer *timer) {
+    return timer->clock ? timer->clock(timer->context) : 0;
+}
+
+/* Whether what takes that long fits; a clock that gives NaN never lets anything begin. */
+static inline int br_timer_allows(const br_timer *timer, double now, double duration) {
+    return !timer->limited || timer->deadline - now >= duration;
+}
+
+static inline void br_timer_note(const br_timer *timer, double begin, double *longest) {
+    *longest = fmax(*longest, br_timer_now(timer) - begin);
+}
+
+/* --- br_stage.c: the corrected model --- */
+
+BR_PART void br_stage_features(const double x[BR_NX], const double u[BR_NU], double z[BR_NZ]);
+/* Of at most BR_N + 1 states and inputs. */
+BR_PART void br_stages_variances(const br_gp *gp, int stages, double (*x)[BR_NX],
+                                 double (*u)[BR_NU], double (*work)[BR_COLUMNS],
+                                 double (*variance)[BR_NE]);
+/* gp NULL: without correction. */
+BR_PART void br_stage_advance(const br_gp *gp, const double x[BR_NX], const double u[BR_NU],
+                              double duration, double x_next[BR_NX]);
+BR_PART __typeof__(br_mpc_predict) br_predict;
+BR_PART __typeof__(br_mpc_variance) br_variance;
+BR_PART __typeof__(br_mpc_evaluate) br_evaluate;
+/* br_predict by these weights; gp NULL: without correction. */
+BR_PART br_mpc_error br_predict_by(const br_mpc *mpc, const br_gp *gp, const double x[BR_NX],
+                                   const double u[BR_NU], double duration_s, double x_next[BR_NX]);
+/* So many stages of the plan from one on; their kernels go into the slots from the given one on. */
+BR_PART void br_linearise_stages(br_mpc *mpc, int first, int stages, int slot);
+BR_PART void br_linearise_plan(br_mpc *mpc);
+/* The second derivatives of the linearised plan, for a QP. */
+BR_PART void br_curve_plan(br_mpc *mpc);
+
+/* --- br_planner.c: where the car is to go --- */
+
 BR_PART br_mpc_error br_path_load(br_path *path, const double *table, int n, double spacing);
 BR_PART void br_path_plan(const br_path *path, double pace, br_mpc_reference reference[BR_N]);
 BR_PART void br_path_project(br_path *path, const double x[BR_NX], double *lateral);
@@ -360,36 +342,35 @@ BR_PART void br_path_follow(br_mpc *mpc);
 #else
 static inline void br_path_follow(br_mpc *mpc) { (void)mpc; }
 #endif
-BR_PART void br_path_beside(const br_path *path, const double x[BR_NX], double *s_m,
-                            br_beside *beside);
-BR_PART double br_path_heading(const br_path *path, double s);
-BR_PART double br_path_curvature(const br_path *path, double s);
-BR_PART void br_path_ahead(const br_path *path, double distance, double point[2]);
-
-/* br_turnaround.c */
 BR_PART void br_turnaround(br_mpc *mpc);
+#if BR_HAS_PATH
+BR_PART __typeof__(br_mpc_steer) br_steer;
+#endif
 
-/* br_stage.c */
-/* Values and Jacobians of several stages, which take the slots from the given one on of kernels,
- * with room for so many. */
-BR_PART void br_stages_linearise(const br_gp *gp, int stages, double (*x)[BR_NX],
-                                 double (*u)[BR_NU], br_gp_row *kernels, int room, int slot,
-                                 br_stage *stage);
-/* Hessians of all linearised stages, at the same x and u; of each slot there is one. */
-BR_PART void br_stages_curve(const br_gp *gp, int stages, double (*x)[BR_NX], double (*u)[BR_NU],
-                             double (*lambda)[BR_NX], br_gp_row *kernels, br_stage *stage);
-BR_PART void br_stage_features(const double x[BR_NX], const double u[BR_NU], double z[BR_NZ]);
-/* Of at most BR_N + 1 states and inputs. */
-BR_PART void br_stages_variances(const br_gp *gp, int stages, double (*x)[BR_NX],
-                                 double (*u)[BR_NU], double (*work)[BR_COLUMNS],
-                                 double (*variance)[BR_NE]);
-/* gp NULL: without correction. */
-BR_PART void br_stage_next(const br_gp *gp, const double x[BR_NX], const double u[BR_NU],
-                           double x_next[BR_NX]);
-BR_PART void br_stage_advance(const br_gp *gp, const double x[BR_NX], const double u[BR_NU],
-                              double duration, double x_next[BR_NX]);
+/* --- br_watch.c: predictions against what the car does --- */
 
-/* br_problem.c: cost and constraints as the problem's generated functions have them */
+BR_PART void br_innovation_reset(br_innovation *innovation);
+/* A step has been made: what was observed before it is due. */
+BR_PART void br_innovation_advance(br_innovation *innovation);
+/* By what the standard deviations of the output are to be multiplied. */
+BR_PART double br_innovation_widening(const br_innovation *innovation, int output);
+BR_PART int br_innovation_due(const br_innovation *innovation);
+/* As if what is due had not been judged: parameters or code are others now. */
+BR_PART void br_innovation_undo(br_innovation *innovation);
+/* What is due, by the variance of the residual there; the plan is linearised. */
+BR_PART void br_innovation_judge(br_mpc *mpc, const double variance[BR_NE]);
+BR_PART void br_watch_update(br_mpc *mpc); /* in the preparation */
+
+/* --- br_caution.c: the tube --- */
+
+BR_PART void br_caution_reset(br_caution *caution);
+BR_PART void br_caution_update(br_mpc *mpc);
+BR_PART void br_caution_tighten(br_mpc *mpc, int k, br_stage_terms *terms);
+BR_PART void br_caution_pace(br_mpc *mpc, double elapsed);
+BR_PART void br_caution_report(br_mpc *mpc); /* into mpc->info */
+
+/* --- br_problem.c: cost and constraints, and what a plan is worth --- */
+
 BR_PART void br_evaluate_terms(br_mpc *mpc);
 /* out += (cost_xx + share * rows_xx) dx */
 static inline void br_add_curvature(const br_stage_curvature *second, double share,
@@ -405,24 +386,20 @@ BR_PART void br_evaluate_penalties(br_mpc *mpc);
 BR_PART void br_first_guess(const br_mpc *mpc, const double u_before[BR_NU], double share,
                             double u[BR_NU]);
 BR_PART int br_valid_parameters(const br_mpc_parameters *parameters);
-static inline const double *br_theta(const br_mpc_parameters *parameters) {
-    return (const double *)parameters; /* the problem's come first, all of them doubles */
-}
+BR_PART void br_residuals(br_mpc *mpc);
+BR_PART double br_residual(const br_mpc *mpc);
+BR_PART br_mpc_status br_judge(const br_mpc *mpc);
 
-/* Whether the stage is the first of its block. */
-static inline int br_opens_block(int k) { return k == 0 || BR_BLOCK_OF(k) > BR_BLOCK_OF(k - 1); }
+/* --- br_condense.c --- */
 
-/* Whole vectors that cover columns 0..n-1 of a BR_MP-wide row; the rest of a row is zero. */
-static inline int br_padded(int n) { return (n + 7) & ~7; }
-
-/* br_condense.c */
 BR_PART void br_condense_states(br_mpc *mpc); /* the sensitivities of all states, into qp.g */
 /* Into qp.h, with this share of the second-order part of dynamics and rows. */
 BR_PART void br_condense_hessian(br_mpc *mpc, double tau);
 /* At dU = 0, into qp.gradient; and the change of the states there, into qp.xbar. */
 BR_PART void br_condense_gradient(br_mpc *mpc, double tau);
 
-/* br_qp.c: the QP of one SQP iteration */
+/* --- br_qp.c: the QP of one SQP iteration --- */
+
 BR_PART void br_qp_init(br_qp *qp);
 BR_PART void br_qp_factorise(br_mpc *mpc);
 BR_PART br_mpc_status br_qp_condense(br_mpc *mpc);
@@ -430,69 +407,20 @@ BR_PART br_mpc_status br_qp_solve(br_mpc *mpc, int warm);
 BR_PART void br_qp_shift_rows(void *rows, size_t size);
 BR_PART void br_qp_forget_working_set(br_qp *qp);
 
-/* br_prepare.c: the clock that the host gave */
-BR_PART void br_timer_start(br_timer *timer, double budget);
-BR_PART double br_timer_now(const br_timer *timer);
-BR_PART int br_timer_allows(const br_timer *timer, double now, double duration);
-BR_PART void br_timer_note(const br_timer *timer, double begin, double *longest);
+/* --- br_sqp.c: the plan's start, shift and iteration; the best plan of several iterations --- */
 
-/* br_sqp.c: the plan's start, shift and iteration */
-BR_PART void br_sqp_linearise(br_mpc *mpc);
-BR_PART void br_sqp_curve(br_mpc *mpc);
 BR_PART void br_sqp_cold_start(br_mpc *mpc);
 BR_PART void br_sqp_roll_out(br_mpc *mpc, const double u[BR_NU]);
 BR_PART void br_sqp_shift(br_mpc *mpc);
 BR_PART br_mpc_status br_sqp_iterate(br_mpc *mpc, int warm, int first_of_warm);
-
-/* br_prepare.c: in step with time */
-BR_PART int br_plausible_state(const double x[BR_NX]);
-BR_PART int br_plausible_input(const double u[BR_NU]);
-BR_PART int br_shifts_due(double *lag);
-BR_PART void br_align(br_mpc *mpc, int shifts);
-BR_PART void br_undo_preparation(br_mpc *mpc);
-BR_PART void br_forget_linearisation(br_mpc *mpc);
-
-/* br_step.c, br_prepare.c, br_predict.c, br_planner.c: functions of the interface,
- * see br_code.h */
-BR_PART br_mpc_error br_step(br_mpc *mpc, const double x[BR_NX], const double u_before[BR_NU],
-                             const br_environment *environment, double elapsed_s, double budget_s,
-                             double u[BR_NU], br_mpc_status *status, br_mpc_info *info);
-BR_PART br_mpc_error br_solve(br_mpc *mpc, const double x[BR_NX], const double u_before[BR_NU],
-                              double elapsed_s, double budget_s,
-                              const br_mpc_reference reference[BR_N], double u[BR_NU],
-                              br_mpc_status *status, br_mpc_info *info);
-BR_PART br_mpc_error br_prepare(br_mpc *mpc, double elapsed_s, double budget_s);
-BR_PART br_mpc_error br_rehearse(br_mpc *mpc);
-BR_PART br_mpc_error br_predict(const br_mpc *mpc, const double x[BR_NX], const double u[BR_NU],
-                                double duration_s, double x_next[BR_NX]);
-/* The same by these weights; gp NULL: without correction. */
-BR_PART br_mpc_error br_predict_by(const br_mpc *mpc, const br_gp *gp, const double x[BR_NX],
-                                   const double u[BR_NU], double duration_s, double x_next[BR_NX]);
-BR_PART br_mpc_error br_steer(const br_mpc *mpc, const double x[BR_NX], double *s_m,
-                              double *angle_rad, double *outside_m);
-BR_PART br_mpc_error br_variance(br_mpc *mpc, const double v[BR_NV], double variance[BR_NE]);
-BR_PART br_mpc_error br_evaluate(const br_mpc *mpc, const double v[BR_NV],
-                                 const double lambda[BR_NX], double x_next[BR_NX],
-                                 double jacobian[BR_NX * BR_NV], double hessian[BR_NV * BR_NV]);
-
-/* br_step.c */
-BR_PART br_mpc_status br_start_again(br_mpc *mpc, br_mpc_status status, unsigned turn);
-BR_PART int br_iteration_limit(const br_mpc *mpc);
-
-/* br_sqp.c: the best plan of several iterations */
 BR_PART void br_incumbent_reset(br_mpc *mpc);
 BR_PART void br_incumbent_keep(br_mpc *mpc, br_mpc_status status, int lowest);
 BR_PART br_mpc_status br_incumbent_restore(br_mpc *mpc, br_mpc_status status);
 BR_PART void br_first_plan_keep(br_mpc *mpc, br_mpc_status status);
 BR_PART br_mpc_status br_first_plan_compare(br_mpc *mpc, br_mpc_status status, int *second);
 
-/* br_residuals.c */
-BR_PART int br_all_finite(const double *values, int n);
-/* The larger one, and NaN if either is: fmax would lose a NaN and with it a bad solution. */
-static inline double br_worse(double a, double b) { return b > a || b != b ? b : a; }
-BR_PART void br_residuals(br_mpc *mpc);
-BR_PART double br_residual(const br_mpc *mpc);
-BR_PART br_mpc_status br_judge(const br_mpc *mpc);
-static inline int br_usable(br_mpc_status status) { return status <= BR_ACCEPTABLE; }
+/* --- br_step.c --- */
+
+BR_PART void br_forget_linearisation(br_mpc *mpc);
 
 #endif

@@ -1,12 +1,11 @@
-/* All of the step but the model, once more, by br_avx2.c and br_avx512.c: see br_code.h. */
-
-/* Compiled as if each were in a file of its own: inlined into each other, or copied for constant
- * arguments, which gcc does to functions of one file, second derivatives take a quarter longer. */
-#if defined(__clang__)
-#define BR_PART static __attribute__((noinline))
-#else
-#define BR_PART static __attribute__((noinline, noclone))
-#endif
+/* The step but the generated model, once more, by br_avx2.c and br_avx512.c.
+ *
+ * The step is compiled for several instruction sets, of which the processor's best is chosen at
+ * run time. Each of its files, those below, is compiled as it is, for whatever the compiler is told
+ * to compile for (any x86-64, say). On x86-64, br_avx2.c and br_avx512.c include all of them once
+ * more, each with its own instructions and vectors of its own length; there everything is static
+ * but the table of functions. What is stored in a br_mpc is the same for all, so code may be
+ * exchanged between two calls. Results differ by rounding. */
 
 #pragma GCC diagnostic ignored "-Wunused-function" /* part of it is for other files */
 
@@ -14,14 +13,10 @@
 #include "br_condense.c"
 #include "br_gp.c"
 #include "br_planner.c"
-#include "br_predict.c"
-#include "br_prepare.c"
 #include "br_problem.c"
 #include "br_qp.c"
-#include "br_residuals.c"
 #include "br_sqp.c"
 #include "br_stage.c"
 #include "br_step.c"
-#include "br_turnaround.c"
 #include "br_variance.c"
 #include "br_watch.c"

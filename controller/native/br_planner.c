@@ -5,13 +5,19 @@
  * The path is a table over the closed line's arc length; between rows everything is linear, which
  * at the default 5 mm costs less than .02 mm. The search starts where the car was a step ago and
  * looks no farther than a window, so that it never jumps to a neighbouring piece of the track. All
- * lengths and speeds (BR_PATH_...) are the car's, from its file.
+ * lengths and speeds (BR_PATH_...) are the car's, from its file. Below: braking along the line, and
+ * turning round.
  */
-#include <math.h>
-
 #include "br_internal.h"
 
 #if BR_HAS_PATH
+
+typedef struct {
+    double left_m;    /* of the line */
+    double middle_m;  /* of the track, to the left of the line */
+    double outside_m; /* of the track less its margin; negative inside */
+    double speed_mps; /* of the line */
+} place;
 
 enum { X = 0, Y = 1, SPEED = 2, NORMAL_X = 3, NORMAL_Y = 4, LOWER = 5, UPPER = 6 };
 
@@ -122,32 +128,15 @@ static void project(const br_path *path, int i, const double x[BR_NX], double *s
 }
 
 /* Where the line is, this far ahead of the car's last projection. */
-void br_path_ahead(const br_path *path, double distance, double point[2]) {
+static void path_ahead(const br_path *path, double distance, double point[2]) {
     double row[BR_PATH_COLUMNS];
     path_at(path, path->s + distance, row);
     point[0] = row[X];
     point[1] = row[Y];
 }
 
-/* Where a state is beside the line, sought near *s_m, which follows; below 0: anywhere. */
-void br_path_beside(const br_path *path, const double x[BR_NX], double *s_m, br_beside *beside) {
-    double row[BR_PATH_COLUMNS];
-    const int nearest = *s_m < 0 ? nearest_anywhere(path, x) : nearest_near(path, *s_m, x);
-    project(path, nearest, x, s_m, &beside->left_m);
-    path_at(path, *s_m, row);
-    const double norm = hypot(row[NORMAL_X], row[NORMAL_Y]);
-    const double heading = br_path_heading(path, *s_m);
-    const double leftwards = row[NORMAL_Y] * cos(heading) - row[NORMAL_X] * sin(heading);
-    const double line = row[NORMAL_X] * row[X] + row[NORMAL_Y] * row[Y];
-    const double car = row[NORMAL_X] * x[BR_INDEX_X] + row[NORMAL_Y] * x[BR_INDEX_Y];
-    const double middle = (row[LOWER] + row[UPPER]) / 2 - line;
-    beside->middle_m = copysign(1, leftwards) * middle / norm;
-    beside->outside_m = fmax(row[LOWER] - car, car - row[UPPER]) / norm;
-    beside->speed_mps = row[SPEED];
-}
-
 /* Direction of the line, by a chord. */
-double br_path_heading(const br_path *path, double s) {
+static double path_heading(const br_path *path, double s) {
     double a[BR_PATH_COLUMNS], b[BR_PATH_COLUMNS];
     path_at(path, s - BR_BRAKING_CHORD_M / 2, a);
     path_at(path, s + BR_BRAKING_CHORD_M / 2, b);
@@ -155,10 +144,27 @@ double br_path_heading(const br_path *path, double s) {
 }
 
 /* Its curvature, by two of them. */
-double br_path_curvature(const br_path *path, double s) {
+static double path_curvature(const br_path *path, double s) {
     const double h = BR_BRAKING_CHORD_M / 2;
-    const double turned = br_path_heading(path, s + h) - br_path_heading(path, s - h);
+    const double turned = path_heading(path, s + h) - path_heading(path, s - h);
     return remainder(turned, 2 * M_PI) / (2 * h);
+}
+
+/* Where a state is beside the line, sought near *s_m, which follows; below 0: anywhere. */
+static void path_beside(const br_path *path, const double x[BR_NX], double *s_m, place *beside) {
+    double row[BR_PATH_COLUMNS];
+    const int nearest = *s_m < 0 ? nearest_anywhere(path, x) : nearest_near(path, *s_m, x);
+    project(path, nearest, x, s_m, &beside->left_m);
+    path_at(path, *s_m, row);
+    const double norm = hypot(row[NORMAL_X], row[NORMAL_Y]);
+    const double heading = path_heading(path, *s_m);
+    const double leftwards = row[NORMAL_Y] * cos(heading) - row[NORMAL_X] * sin(heading);
+    const double line = row[NORMAL_X] * row[X] + row[NORMAL_Y] * row[Y];
+    const double car = row[NORMAL_X] * x[BR_INDEX_X] + row[NORMAL_Y] * x[BR_INDEX_Y];
+    const double middle = (row[LOWER] + row[UPPER]) / 2 - line;
+    beside->middle_m = copysign(1, leftwards) * middle / norm;
+    beside->outside_m = fmax(row[LOWER] - car, car - row[UPPER]) / norm;
+    beside->speed_mps = row[SPEED];
 }
 
 /* Where the car is on the line: path->s, and its distance to the left. */
@@ -274,24 +280,112 @@ br_mpc_error br_steer(const br_mpc *mpc, const double x[BR_NX], double *s_m, dou
     if (!br_plausible_state(x)) return BR_ERROR_STATE;
     const br_mpc_parameters *p = &mpc->parameters;
     const double vx = fmax(x[BR_INDEX_VX], 0), vy = x[BR_INDEX_VY];
-    br_beside here;
-    br_path_beside(&mpc->path, x, s_m, &here);
+    place here;
+    path_beside(&mpc->path, x, s_m, &here);
     *outside_m = here.outside_m;
 
     const double share = vx / here.speed_mps;
     const double middle = BR_BRAKING_CENTRE * fmax(1 - share * share, 0) * here.middle_m;
     const double reach = BR_BRAKING_LOOKAHEAD_M + BR_BRAKING_LOOKAHEAD_S * vx;
     const double sideways = asin(fmin(fmax((here.left_m - middle) / reach, -1), 1));
-    const double heading = br_path_heading(&mpc->path, *s_m);
+    const double heading = path_heading(&mpc->path, *s_m);
     const double course = x[BR_INDEX_PSI] + atan2(vy, fmax(vx, BR_BRAKING_SLOW_MPS)) - heading;
     const double back = 2 * sin(remainder(-sideways - course, 2 * M_PI)) / reach;
-    const double kappa = br_path_curvature(&mpc->path, *s_m + vx * BR_BRAKING_PREVIEW_S) + back;
-    const double excess = x[BR_INDEX_OMEGA] - vx * br_path_curvature(&mpc->path, *s_m);
+    const double kappa = path_curvature(&mpc->path, *s_m + vx * BR_BRAKING_PREVIEW_S) + back;
+    const double excess = x[BR_INDEX_OMEGA] - vx * path_curvature(&mpc->path, *s_m);
     const double angle = atan(BR_WHEELBASE_M * kappa) +
                          BR_BRAKING_UNDERSTEER_S2PM * kappa * vx * vx -
                          BR_BRAKING_DAMPING_S * excess;
     *angle_rad = fmin(fmax(angle, -p->delta_max_rad), p->delta_max_rad);
     return BR_OK;
+}
+
+/* Turning round: what the planner does where the car is slow and points away from its line.
+ *
+ * A horizon is too short for a turn to pay: whichever way the car sets off, it first gets farther
+ * from the reference, and the optimal plan is to stand still for ever. So the reference runs
+ * along the turn itself: where the corrected model goes when it steers to one side at a walking
+ * pace until it faces the line again. The track's edges do not count on the way; the car may
+ * have been across one already, and its turning circle can be wider than the track. All numbers
+ * (BR_TURN_...) are the car's, from its file.
+ */
+
+/* A reward of progress along the line leads a car back that points aside, but not one that points
+ * the other way. */
+#define BEGIN_RAD (BR_FOLLOWS_PLAN ? BR_TURN_BEHIND_RAD : BR_TURN_AWAY_RAD)
+
+/* Angle to the point, seen from the car; positive left. */
+static double bearing(const double x[BR_NX], const double to[2]) {
+    return remainder(atan2(to[1] - x[BR_INDEX_Y], to[0] - x[BR_INDEX_X]) - x[BR_INDEX_PSI],
+                     2 * M_PI);
+}
+
+/* The side to turn to: the nearer one, or, with the line behind, the one with more room. */
+static double side(const double x[BR_NX], double away, const br_mpc_reference *here) {
+    if (fabs(away) < BR_TURN_BEHIND_RAD) return copysign(1, away);
+    const double along = here->normal_x * x[BR_INDEX_X] + here->normal_y * x[BR_INDEX_Y];
+    const double room_left = here->upper - along, room_right = along - here->lower;
+    const double facing =
+        here->normal_x * -sin(x[BR_INDEX_PSI]) + here->normal_y * cos(x[BR_INDEX_PSI]);
+    return copysign(1, (room_left - room_right) * facing);
+}
+
+/* Angle still to be turned by; below zero where the car has turned too far, by a quarter at most.
+ */
+static double remaining(double turn, double away) {
+    const double angle = turn * away;
+    return angle < -M_PI / 2 ? angle + 2 * M_PI : angle;
+}
+
+/* The same angle for a car that follows the line: in a tight bend the point is far to one side, and
+ * no turn is needed. */
+static double bearing_on_line(const br_path *path, const double to[2]) {
+    double here[BR_NX] = {0}, next[2];
+    path_ahead(path, 0, here);
+    path_ahead(path, BR_TURN_TANGENT_M, next);
+    here[BR_INDEX_PSI] = atan2(next[1] - here[1], next[0] - here[0]);
+    return bearing(here, to);
+}
+
+/* Begins, goes on with and ends a turn, of a slow or turning car. */
+static void decide(br_mpc *mpc, const double target[2]) {
+    const double *x = mpc->x0, away = bearing(x, target), speed = fabs(x[BR_INDEX_VX]);
+    if (mpc->path.speed_limit < BR_TURN_STOP_MPS || speed > BR_TURN_TOO_FAST_MPS) {
+        mpc->turn = 0;
+    } else if (mpc->turn) {
+        if (remaining(mpc->turn, away) < BR_TURN_FACED_RAD) mpc->turn = 0;
+    } else if (fabs(away) > BEGIN_RAD &&
+               fabs(remainder(away - bearing_on_line(&mpc->path, target), 2 * M_PI)) > BEGIN_RAD) {
+        mpc->turn = side(x, away, &mpc->reference[0]);
+        mpc->warm = 0;
+    }
+}
+
+void br_turnaround(br_mpc *mpc) {
+    double target[2], x[BR_NX], next[BR_NX];
+    if (!mpc->turn && fabs(mpc->x0[BR_INDEX_VX]) >= BR_TURN_SLOW_MPS) return;
+    path_ahead(&mpc->path, BR_TURN_AHEAD_M, target);
+    decide(mpc, target);
+    if (!mpc->turn) return;
+    const br_mpc_parameters *p = &mpc->parameters;
+    const double pace = fmin(BR_TURN_PACE_MPS, mpc->path.speed_limit);
+    memcpy(x, mpc->x0, sizeof x);
+    for (int k = 0; k < BR_N; ++k) {
+        const double angle = remaining(mpc->turn, bearing(x, target));
+        const double steering = mpc->turn * fmax(fmin(angle, p->delta_max_rad), -p->delta_max_rad);
+        const double rate = (steering - x[BR_INDEX_DELTA]) / BR_TS;
+        double *u = mpc->turn_u[k];
+        u[BR_INDEX_DUTY] = fmin(fmax(BR_TURN_THROTTLE_SPM * (pace - x[BR_INDEX_VX]), 0), p->d_max);
+        u[BR_INDEX_DELTA_RATE] =
+            fmin(fmax(rate, -p->delta_rate_max_radps), p->delta_rate_max_radps);
+        br_stage_advance(&mpc->gp[mpc->gp_in_use], x, u, BR_TS, next);
+        memcpy(x, next, sizeof x);
+        br_mpc_reference *reference = &mpc->reference[k];
+        reference->x = x[BR_INDEX_X];
+        reference->y = x[BR_INDEX_Y];
+        reference->lower -= BR_TURN_WIDER_M;
+        reference->upper += BR_TURN_WIDER_M;
+    }
 }
 
 #endif

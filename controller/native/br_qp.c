@@ -12,8 +12,6 @@
  * which neither allocates nor reads a clock. docs/decisions/ says why DAQP and not HPIPM.
  */
 #include <daqp/daqp.h>
-#include <math.h>
-
 #include "br_internal.h"
 
 #define POSITIVE_DEFINITE 1e-10 /* smallest pivot, relative to the largest diagonal entry */
@@ -176,7 +174,7 @@ void br_qp_factorise(br_mpc *mpc) {
     static const double curvature[] = {1.0, 0.5, 0.25, 0.0};
     br_qp *qp = &mpc->qp;
     mpc->valid[BR_FACTORS] = 0;
-    br_sqp_curve(mpc);
+    br_curve_plan(mpc);
     br_evaluate_curvature(mpc);
     br_condense_states(mpc);
     for (int attempt = 0; attempt < 4; ++attempt) {

@@ -6,29 +6,7 @@
  * from: only its last stage is new. Residuals need no second derivatives. These are made when a QP
  * does: after the last iteration of a step, by br_mpc_prepare.
  */
-#include <math.h>
-
 #include "br_internal.h"
-
-/* So many stages from one on; their kernels go into the slots from the given one on. */
-static void linearise(br_mpc *mpc, int first, int stages, int slot) {
-    br_invalidate(mpc, BR_FACTORS); /* the tube stays that of the plan the step started with */
-    mpc->curved = 0;
-    mpc->valid[BR_LINEARISATION] = 1;
-    br_stages_linearise(&mpc->gp[mpc->gp_in_use], stages, &mpc->plan.x[first], &mpc->plan.u[first],
-                        mpc->kernels, BR_N, slot, &mpc->stage[first]);
-}
-
-void br_sqp_linearise(br_mpc *mpc) { linearise(mpc, 0, BR_N, 0); }
-
-/* The second derivatives of the linearised stages, for a QP: the last linearisation of a step
- * has none before its plan has been sent. */
-void br_sqp_curve(br_mpc *mpc) {
-    if (mpc->curved) return;
-    mpc->curved = 1;
-    br_stages_curve(&mpc->gp[mpc->gp_in_use], BR_N, mpc->plan.x, mpc->plan.u, mpc->plan.costate + 1,
-                    mpc->kernels, mpc->stage);
-}
 
 /* Without a plan from before: the problem's guess, see where that leads; or turn. Where that has
  * led to no plan, Newton's steps may go round in circles: then, but for a turn, another guess is
@@ -47,7 +25,7 @@ void br_sqp_roll_out(br_mpc *mpc, const double u[BR_NU]) {
     memset(mpc->plan.multiplier, 0, sizeof mpc->plan.multiplier);
     for (int k = 0; k < BR_N; ++k) {
         memcpy(mpc->plan.u[k], mpc->turn ? mpc->turn_u[k] : u, sizeof mpc->plan.u[k]);
-        linearise(mpc, k, 1, k);
+        br_linearise_stages(mpc, k, 1, k);
         memcpy(mpc->plan.x[k + 1], mpc->stage[k].f, sizeof mpc->plan.x[k + 1]);
     }
     br_qp_forget_working_set(&mpc->qp);
@@ -66,9 +44,9 @@ void br_sqp_shift(br_mpc *mpc) {
     for (int c = 0; c < BR_NU; ++c)
         if (!BR_INPUT_HELD[c]) mpc->plan.u[last][c] = 0;
     if (mpc->valid[BR_LINEARISATION])
-        linearise(mpc, last, 1, free_slot);
+        br_linearise_stages(mpc, last, 1, free_slot);
     else
-        br_sqp_linearise(mpc);
+        br_linearise_plan(mpc);
     memcpy(mpc->plan.x[BR_N], mpc->stage[last].f, sizeof mpc->plan.x[BR_N]);
 }
 
@@ -132,7 +110,7 @@ static void move(br_mpc *mpc, double t) {
     for (int i = 0; i < BR_NU * BR_N; ++i) u[i] = u_from[i] + t * qp->delta_u[i];
     blend(mpc->plan.costate[1], from->costate[1], qp->costate_next[1], t, BR_N * BR_NX);
     blend(mpc->plan.multiplier, from->multiplier, qp->multiplier, t, BR_ROWS);
-    br_sqp_linearise(mpc);
+    br_linearise_plan(mpc);
 }
 
 /* Exact penalty: above every costate that prices a defect. */

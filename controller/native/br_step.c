@@ -1,21 +1,58 @@
-/* The control step: what a call brings, the plan in step with it, iterations, the answer. */
-#include <math.h>
-
+/* The control step in its two phases: feedback, from what a call brings to its answer, and the
+ * preparation between two steps. */
 #include "br_internal.h"
 
 /* With a budget, and in the preparation, time is the limit; this one is for slow convergence. */
-int br_iteration_limit(const br_mpc *mpc) {
+static int iteration_limit(const br_mpc *mpc) {
     const br_mpc_parameters *p = &mpc->parameters;
     return p->iterations > p->iterations_cold ? p->iterations : p->iterations_cold;
+}
+
+static void start_timer(br_timer *timer, double budget) {
+    timer->limited = timer->clock && budget > 0;
+    timer->deadline = timer->limited ? br_timer_now(timer) + budget : 0;
+}
+
+/* --- the plan in step with time --- */
+
+/* Whole stages that a plan behind by *lag, which is below the horizon, has to be shifted; *lag is
+ * what remains, at most half a stage to either side. */
+static int shifts_due(double *lag) {
+    int shifts = 0;
+    for (; *lag >= 0.5 * BR_TS; *lag -= BR_TS) ++shifts;
+    return shifts;
+}
+
+static void undo_preparation(br_mpc *mpc) {
+    if (mpc->ahead) {
+        mpc->plan = mpc->kept;
+        memcpy(mpc->qp.sense, mpc->kept_sense, sizeof mpc->kept_sense);
+        br_invalidate(mpc, BR_LINEARISATION);
+    }
+    mpc->ahead = mpc->looked = 0;
+    br_innovation_undo(&mpc->innovation);
+}
+
+/* Of other weights or code; the preparation's new last stage was predicted with those before. */
+void br_forget_linearisation(br_mpc *mpc) {
+    undo_preparation(mpc);
+    br_invalidate(mpc, BR_LINEARISATION);
+}
+
+/* The plan, shifted that often since the step before and linearised. */
+static void align(br_mpc *mpc, int shifts) {
+    if (shifts < mpc->ahead) undo_preparation(mpc); /* the step comes sooner than expected */
+    for (; mpc->ahead < shifts; mpc->ahead += 1) br_sqp_shift(mpc);
+    if (!mpc->valid[BR_LINEARISATION]) br_linearise_plan(mpc);
 }
 
 /* The plan at the time of the measured state. Without one, or with one that is older than the
  * horizon or has not become usable in as many iterations as a cold start may take, a new one. */
 static void begin_plan(br_mpc *mpc) {
-    if (mpc->lag >= BR_HORIZON_S || mpc->unfinished >= br_iteration_limit(mpc)) mpc->warm = 0;
+    if (mpc->lag >= BR_HORIZON_S || mpc->unfinished >= iteration_limit(mpc)) mpc->warm = 0;
     if (mpc->warm) {
-        mpc->info.shifts = br_shifts_due(&mpc->lag);
-        br_align(mpc, mpc->info.shifts);
+        mpc->info.shifts = shifts_due(&mpc->lag);
+        align(mpc, mpc->info.shifts);
     } else {
         br_sqp_cold_start(mpc);
         br_invalidate(mpc, BR_TUBE);
@@ -27,6 +64,8 @@ static void begin_plan(br_mpc *mpc) {
     mpc->ahead = mpc->prepared = 0;
     br_caution_update(mpc);
 }
+
+/* --- iterations, from one start or several --- */
 
 /* Another iteration would change little that matters until the next step, or, where the Hessian is
  * indefinite and convergence slow, cost more than it gives, which only a budget shows: with one
@@ -88,7 +127,7 @@ static int worth_a_try(br_mpc *mpc) {
 /* Iterates from another start, with another guess each time in a row; leaves the better plan of
  * that and the one at hand. To coast from the measured state most often leads to the good minimum
  * in a few iterations (docs/decisions/2026-11-22-second-start.md). */
-br_mpc_status br_start_again(br_mpc *mpc, br_mpc_status status, unsigned turn) {
+static br_mpc_status start_again(br_mpc *mpc, br_mpc_status status, unsigned turn) {
     static const double shares[] = {0, 0.5, 1, 0.25}, nothing[BR_NU] = {0};
     const int time_limited = mpc->info.time_limited;
     double u[BR_NU];
@@ -144,7 +183,7 @@ static br_mpc_status optimise(br_mpc *mpc) {
     br_timer *timer = &mpc->timer;
     begin_plan(mpc);
     timer->iteration = timer->trial = 0; /* a stall must not be remembered for ever */
-    const int most = br_iteration_limit(mpc);
+    const int most = iteration_limit(mpc);
     if (!mpc->warm) return start_cold(mpc, timer->limited ? most : mpc->parameters.iterations_cold);
     br_residuals(mpc);
     const double shifted_cost = mpc->info.cost;
@@ -153,7 +192,7 @@ static br_mpc_status optimise(br_mpc *mpc) {
         mpc->futile = mpc->starts = 0;
     else if (!mpc->info.time_limited &&
              br_timer_allows(timer, br_timer_now(timer), 3 * timer->iteration) && worth_a_try(mpc))
-        status = br_start_again(mpc, status, mpc->starts++);
+        status = start_again(mpc, status, mpc->starts++);
     mpc->info.shifted_cost = shifted_cost;
     return status;
 }
@@ -179,31 +218,28 @@ static void solve(br_mpc *mpc, double u[BR_NU], br_mpc_status *status, br_mpc_in
     if (info) *info = mpc->info;
 }
 
-typedef struct {
-    const double *x, *u_before;
-    double elapsed_s, budget_s;
-    const double *u;
-    br_mpc_status *status;
-    br_mpc_info *info;
-} request;
+/* --- the step --- */
 
-static br_mpc_error begin(br_mpc *mpc, const request *r, int *plausible) {
-    if (!r->x || !r->u_before || !r->u || !r->status) return BR_ERROR_NULL;
-    br_timer_start(&mpc->timer, r->budget_s);
-    *r->status = BR_BAD_STATE; /* until there is something better to say */
+/* What a call brings; *plausible: its state and input may be solved for. */
+static br_mpc_error begin(br_mpc *mpc, const double *x, const double *u_before, double elapsed_s,
+                          double budget_s, const double *u, br_mpc_status *status,
+                          br_mpc_info *info, int *plausible) {
+    if (!x || !u_before || !u || !status) return BR_ERROR_NULL;
+    start_timer(&mpc->timer, budget_s);
+    *status = BR_BAD_STATE; /* until there is something better to say */
     memset(&mpc->info, 0, sizeof mpc->info);
     mpc->info.status = BR_BAD_STATE;
     br_caution_report(mpc);
-    if (r->info) *r->info = mpc->info;
+    if (info) *info = mpc->info;
     if (!mpc->has_parameters) return BR_ERROR_NOT_READY;
-    if (!(r->elapsed_s >= 0 && isfinite(r->elapsed_s))) return BR_ERROR_TIME;
-    mpc->elapsed = r->elapsed_s;
-    mpc->lag += r->elapsed_s;
-    mpc->path.age += r->elapsed_s;
-    *plausible = br_plausible_state(r->x) && br_plausible_input(r->u_before);
+    if (!(elapsed_s >= 0 && isfinite(elapsed_s))) return BR_ERROR_TIME;
+    mpc->elapsed = elapsed_s;
+    mpc->lag += elapsed_s;
+    mpc->path.age += elapsed_s;
+    *plausible = br_plausible_state(x) && br_plausible(u_before, BR_INPUT_LIMIT, BR_NU);
     if (!*plausible) return BR_OK;
-    memcpy(mpc->x0, r->x, sizeof mpc->x0);
-    memcpy(mpc->u_before, r->u_before, sizeof mpc->u_before);
+    memcpy(mpc->x0, x, sizeof mpc->x0);
+    memcpy(mpc->u_before, u_before, sizeof mpc->u_before);
     br_evaluate_bounds(mpc);
     br_invalidate(mpc, BR_TERMS);
     mpc->info.prepared_iterations = mpc->prepared_iterations;
@@ -239,12 +275,12 @@ static void plan_reference(br_mpc *mpc) {
 }
 #endif
 
-br_mpc_error br_step(br_mpc *mpc, const double x[BR_NX], const double u_before[BR_NU],
-                     const br_environment *environment, double elapsed_s, double budget_s,
-                     double u[BR_NU], br_mpc_status *status, br_mpc_info *info) {
+static br_mpc_error br_step(br_mpc *mpc, const double x[BR_NX], const double u_before[BR_NU],
+                            const br_environment *environment, double elapsed_s, double budget_s,
+                            double u[BR_NU], br_mpc_status *status, br_mpc_info *info) {
     int plausible;
-    const request r = {x, u_before, elapsed_s, budget_s, u, status, info};
-    const br_mpc_error error = begin(mpc, &r, &plausible);
+    const br_mpc_error error =
+        begin(mpc, x, u_before, elapsed_s, budget_s, u, status, info, &plausible);
     if (error) return error;
     if (!mpc->path.ready) return BR_ERROR_NOT_READY; /* as always without a path */
     if (take_environment(mpc, environment)) return BR_ERROR_PARAMETERS;
@@ -259,13 +295,14 @@ br_mpc_error br_step(br_mpc *mpc, const double x[BR_NX], const double u_before[B
     return BR_OK;
 }
 
-br_mpc_error br_solve(br_mpc *mpc, const double x[BR_NX], const double u_before[BR_NU],
-                      double elapsed_s, double budget_s, const br_mpc_reference reference[BR_N],
-                      double u[BR_NU], br_mpc_status *status, br_mpc_info *info) {
+static br_mpc_error br_solve(br_mpc *mpc, const double x[BR_NX], const double u_before[BR_NU],
+                             double elapsed_s, double budget_s,
+                             const br_mpc_reference reference[BR_N], double u[BR_NU],
+                             br_mpc_status *status, br_mpc_info *info) {
     if (!reference) return BR_ERROR_NULL;
     int plausible;
-    const request r = {x, u_before, elapsed_s, budget_s, u, status, info};
-    const br_mpc_error error = begin(mpc, &r, &plausible);
+    const br_mpc_error error =
+        begin(mpc, x, u_before, elapsed_s, budget_s, u, status, info, &plausible);
     if (error || !plausible) return error;
     memcpy(mpc->reference, reference, sizeof mpc->reference);
     mpc->turn = mpc->follows = 0;
@@ -274,11 +311,134 @@ br_mpc_error br_solve(br_mpc *mpc, const double x[BR_NX], const double u_before[
     return BR_OK;
 }
 
-/* The table of this code's functions: see br_code.h. */
-#ifndef BR_CODE
-#define BR_CODE br_code_baseline
-#endif
+/* --- the preparation --- */
 
+/* Time for an iteration, and what follows it: restoring the best plan, shift and factorisation,
+ * which take another one's, and caution. */
+static double iteration_and_rest(const br_timer *timer) {
+    return 2 * timer->iteration + timer->caution;
+}
+
+/* The next problem as far as it can be told: from the state that the plan predicts after so many
+ * shifts, with the input before it and the line's reference there. Without a shift, the last one.
+ */
+static void foresee(br_mpc *mpc, double elapsed, int shifts) {
+    memcpy(mpc->reference, mpc->answer_reference, sizeof mpc->reference);
+    if (shifts) {
+        memcpy(mpc->x0, mpc->plan.x[0], sizeof mpc->x0);
+        memcpy(mpc->u_before, mpc->answer_u[shifts - 1], sizeof mpc->u_before);
+    }
+#if BR_HAS_PATH
+    if (shifts && !mpc->follows) {
+        double lateral;
+        mpc->path.age += elapsed;
+        br_path_project(&mpc->path, mpc->x0, &lateral);
+        br_path_plan(&mpc->path, mpc->caution.pace, mpc->reference);
+    }
+#endif
+    br_invalidate(mpc, BR_FOLLOWED);
+    br_evaluate_bounds(mpc);
+    br_path_follow(mpc);
+}
+
+/* Iterations at the problem at hand, towards tolerance. Returns whether there may be time left. */
+static int improve(br_mpc *mpc, int shifts) {
+    const br_timer *timer = &mpc->timer;
+    memset(&mpc->info, 0, sizeof mpc->info);
+    mpc->penalty = 0;
+    if (shifts) br_caution_update(mpc); /* else it is that of the last step */
+    br_residuals(mpc);
+    br_mpc_status status = br_judge(mpc);
+    br_incumbent_reset(mpc);
+    br_incumbent_keep(mpc, status, 1);
+    const int limit = iteration_limit(mpc);
+    int time = 1;
+    while (mpc->info.iterations < limit && (status == BR_ACCEPTABLE || status == BR_DEFECT)) {
+        time = br_timer_allows(timer, br_timer_now(timer), iteration_and_rest(timer));
+        if (!time) break;
+        status = br_sqp_iterate(mpc, 1, shifts && mpc->info.iterations == 0);
+        br_incumbent_keep(mpc, status, 1);
+    }
+    mpc->prepared_iterations += mpc->info.iterations;
+    br_incumbent_restore(mpc, status);
+    return time;
+}
+
+/* Looks for a better local minimum from another start, if there is time for that and for what
+ * follows. */
+static void look_elsewhere(br_mpc *mpc) {
+    br_timer *timer = &mpc->timer;
+    if (mpc->follows) return; /* costs from different feet on the line do not compare */
+    timer->deadline -= iteration_and_rest(timer);
+    if (!br_timer_allows(timer, br_timer_now(timer), BR_SECOND_START_ITERATIONS * timer->iteration))
+        return;
+    if (!mpc->valid[BR_LINEARISATION]) br_linearise_plan(mpc);
+    memset(&mpc->info, 0, sizeof mpc->info);
+    br_residuals(mpc);
+    const br_mpc_status status = br_judge(mpc);
+    if (br_usable(status)) start_again(mpc, status, mpc->looks++);
+    mpc->looked = br_usable(status) && !mpc->own_reference;
+    mpc->prepared_iterations += mpc->info.iterations;
+}
+
+/* Solves the problem that is foreseen, so that the step begins near its solution: the advanced-step
+ * real-time iteration (Nurkanovic, Zanelli, Albrecht, Diehl, "The advanced step real time iteration
+ * for NMPC", 2019). */
+static void solve_ahead(br_mpc *mpc, double elapsed, int shifts) {
+    const br_timer *timer = &mpc->timer;
+    if (mpc->turn) return;               /* its reference is made from the measured state */
+    if (!(timer->iteration > 0)) return; /* no step has shown yet how long one takes */
+    const double needed = iteration_and_rest(timer) + (shifts ? timer->caution : 0);
+    if (!br_timer_allows(timer, br_timer_now(timer), needed)) return;
+    if (!mpc->valid[BR_LINEARISATION]) br_linearise_plan(mpc);
+    double x0[BR_NX], u_before[BR_NU];
+    const double s = mpc->path.s, age = mpc->path.age;
+    const int known = mpc->path.known;
+    memcpy(x0, mpc->x0, sizeof x0);
+    memcpy(u_before, mpc->u_before, sizeof u_before);
+    foresee(mpc, elapsed, shifts);
+    if (improve(mpc, shifts)) look_elsewhere(mpc);
+    br_invalidate(mpc, BR_TUBE);
+    if (!mpc->valid[BR_LINEARISATION]) br_linearise_plan(mpc);
+    memcpy(mpc->x0, x0, sizeof x0);
+    memcpy(mpc->u_before, u_before, sizeof u_before);
+    mpc->path.s = s;
+    mpc->path.age = age;
+    mpc->path.known = known;
+}
+
+static br_mpc_error br_prepare(br_mpc *mpc, double elapsed_s, double budget_s) {
+    start_timer(&mpc->timer, budget_s);
+    if (!mpc->has_parameters) return BR_ERROR_NOT_READY;
+    if (!(elapsed_s >= 0 && isfinite(elapsed_s))) return BR_ERROR_TIME;
+    br_watch_update(mpc);
+    double lag = mpc->lag + elapsed_s;
+    if (!mpc->warm || lag >= BR_HORIZON_S) return BR_OK;
+    const int first = !mpc->ahead, shifts = shifts_due(&lag);
+    const int ahead = first && mpc->timer.limited, known = !mpc->own_reference;
+    if (ahead && !known) solve_ahead(mpc, elapsed_s, 0); /* the next reference is the caller's */
+    if (first) {
+        mpc->kept = mpc->plan;
+        memcpy(mpc->kept_sense, mpc->qp.sense, sizeof mpc->kept_sense);
+    }
+    align(mpc, shifts);
+    if (ahead && known) solve_ahead(mpc, elapsed_s, shifts);
+    br_path_follow(mpc);
+    br_caution_update(mpc);
+    if (!mpc->valid[BR_FACTORS]) br_qp_factorise(mpc);
+    mpc->prepared = mpc->valid[BR_FACTORS];
+    return BR_OK;
+}
+
+static br_mpc_error br_rehearse(br_mpc *mpc) {
+    if (!mpc->prepared || !mpc->valid[BR_FACTORS]) return BR_OK;
+    br_linearise_plan(mpc);
+    br_path_follow(mpc);
+    br_qp_factorise(mpc);
+    return BR_OK;
+}
+
+/* The functions of this code: see br_parts.h. */
 const br_code BR_CODE = {.step = br_step,
                          .solve = br_solve,
                          .prepare = br_prepare,

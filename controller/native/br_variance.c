@@ -8,10 +8,7 @@
  * leaves a larger variance, never a smaller one. W is made when weights are loaded, by the thread
  * that stages them. W k of all stages is a product of two matrices.
  */
-#include <math.h>
-
 #include "br_internal.h"
-#include "br_kernel.h"
 
 #define VECTORS (BR_COLUMNS / BR_LANES)       /* that a row of a tile has */
 #define ROWS (VECTORS > 2 ? 4 : BR_ROOT_TILE) /* of W at a time: as much as the registers hold */

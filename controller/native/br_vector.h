@@ -1,5 +1,5 @@
-/* Short vectors through the compilers' vector extension (gcc, clang): no intrinsics, so that the
- * same source serves x86-64 and aarch64. */
+/* What the compilers' extensions (gcc, clang) give: short vectors without intrinsics, so that the
+ * same source serves x86-64 and aarch64, and how functions and loops are compiled. */
 #ifndef BR_VECTOR_H
 #define BR_VECTOR_H
 
@@ -7,6 +7,29 @@
 #include <string.h>
 
 #define BR_ALIGNED __attribute__((aligned(64)))
+
+/* Linkage of what the parts of the step know of each other. Each function is compiled by itself:
+ * if they were inlined into each other, or copied for constant arguments, second derivatives would
+ * take a quarter longer. */
+#if defined(__clang__)
+#define BR_APART __attribute__((noinline))
+#else
+#define BR_APART __attribute__((noinline, noclone))
+#endif
+#ifdef BR_CODE
+#define BR_PART static BR_APART
+#else
+#define BR_PART BR_APART
+#define BR_CODE br_code_baseline
+#endif
+
+/* Before loops over states, inputs, rows and their nonzeros, which have constant bounds: unrolled,
+ * the problem's sparsity is in the code, and no table is read. */
+#ifdef __clang__
+#define BR_UNROLL _Pragma("unroll")
+#else
+#define BR_UNROLL _Pragma("GCC unroll 16")
+#endif
 
 /* Numbers of a vector. br_avx2.c and br_avx512.c define it before; else what every x86-64 and
  * aarch64 has. */

@@ -1,5 +1,84 @@
-/* Whether a measured state can be believed: what it says of position and velocity must fit, and
- * both must follow from the state before.
+/* Received states: which of them count, whether what they say can be believed, and the state at the
+ * moment from which the new input will act. */
+#include <math.h>
+#include <string.h>
+
+#include "br_cycle.h"
+
+#if BR_HAS_PATH
+
+/* --- which states count: those of the current plant and run, each newer than the one before --- */
+
+/* A number that is farther ahead than this is not taken for the next one of the run at once: as
+ * many states, or, where their interval allows more, as much time, and at most so many states. */
+#define AHEAD 16
+#define AHEAD_S 0.3
+#define FARTHEST 256
+#define CONFIRMED 4 /* states in a row that belong together are a stream of their own */
+
+void br_stream_init(br_stream *stream) { *stream = (br_stream){.ended = 1, .silent = 1}; }
+
+static int same_run(const br_measured *a, const br_measured *b) {
+    return a->epoch == b->epoch && a->run == b->run;
+}
+
+static int follows(const br_measured *state, const br_measured *before, double interval_s) {
+    const double in_time = interval_s > 0 ? AHEAD_S / interval_s : 0;
+    const double most = fmin(fmax(in_time, AHEAD), FARTHEST);
+    if (state->seq <= before->seq) return 0;
+    return (double)((uint64_t)state->seq - (uint64_t)before->seq) <= most;
+}
+
+/* Whether it continues the stream, or nothing speaks against another one. */
+static int continues(const br_stream *stream, const br_measured *state, double interval_s) {
+    if (!stream->has_newest || stream->silent) return 1;
+    if (!same_run(state, &stream->newest)) return stream->ended;
+    return follows(state, &stream->newest, interval_s);
+}
+
+/* Whether it is the last of several in a row that are a stream of their own. */
+static int confirmed(br_stream *stream, const br_measured *state, double interval_s) {
+    const int belongs = stream->has_other && same_run(state, &stream->other) &&
+                        follows(state, &stream->other, interval_s);
+    stream->others = belongs ? stream->others + 1 : 1;
+    stream->other = *state;
+    stream->has_other = 1;
+    return stream->others >= CONFIRMED;
+}
+
+br_reception br_stream_accept(br_stream *stream, const br_measured *state, br_counters *counters) {
+    const br_measured *newest = &stream->newest;
+    const int same = stream->has_newest && same_run(state, newest);
+    const double interval_s = counters->interval_s;
+    if (!continues(stream, state, interval_s) && !confirmed(stream, state, interval_s)) {
+        const int stale = same && state->seq <= newest->seq;
+        if (stale)
+            counters->stale += 1;
+        else
+            counters->foreign += 1;
+        return stale ? BR_STATE_STALE : BR_STATE_FOREIGN;
+    }
+    if (same && (uint64_t)state->seq == (uint64_t)newest->seq + 1)
+        counters->interval_s = fmax(state->time_s - newest->time_s, 0);
+    else if (!same)
+        counters->interval_s = 0;
+    stream->newest = *state;
+    stream->has_newest = 1;
+    stream->has_other = stream->others = stream->ended = stream->silent = 0;
+    return BR_STATE_NEW;
+}
+
+int br_stream_forget(br_stream *stream, br_counters *counters) {
+    const int waits = stream->has_other && stream->other.lockstep;
+    stream->ended = stream->silent = 1;
+    stream->has_other = 0;
+    counters->interval_s = 0;
+    return waits;
+}
+
+/* --- whether a measured state can be believed ---
+ *
+ * What it says of position and velocity must fit, and both must follow from the state before.
  *
  * Position, heading and steering angle are compared with the way that the measured velocities, yaw
  * rate and applied steering rate have made since they last agreed; the comparison forgets over
@@ -8,12 +87,6 @@
  * not. A state that contradicts is replaced by the prediction of the corrected model from the last
  * state beyond doubt. States are believed again once several in a row agree with each other and
  * with the prediction. The bounds (BR_MONITOR_...) are the car's, from its file. */
-#include <math.h>
-#include <string.h>
-
-#include "br_cycle.h"
-
-#if BR_HAS_PATH
 
 #define AGREEING 3       /* states in a row that end the distrust */
 #define BEYOND_DOUBT 0.1 /* share of the bounds */
@@ -224,6 +297,77 @@ br_fault br_monitor_check(br_monitor *monitor, const br_driving *settings,
     memcpy(state->x, monitor->x, sizeof monitor->x);
     state->time_s = monitor->time_s;
     return monitor->distrusted;
+}
+
+/* --- delay compensation: the state at the moment from which the new input will act ---
+ *
+ * The plant reports, in its own time, how long after the decision on it each input began to act;
+ * the median of the newest delays is the delay. The input decided at plant time t acts from t +
+ * delay on. Until then the inputs that were sent before act, each from its own decision plus the
+ * delay on; the corrected model carries the state through them. No clocks have to agree. */
+
+/* The lower median. */
+static double median(const double *values, int n) {
+    double ordered[BR_MEDIAN_OF];
+    for (int i = 0; i < n; ++i) {
+        int k = i;
+        for (; k > 0 && ordered[k - 1] > values[i]; --k) ordered[k] = ordered[k - 1];
+        ordered[k] = values[i];
+    }
+    return ordered[(n - 1) / 2];
+}
+
+void br_delay_observe(br_delay *delay, const br_driving *settings, const br_measured *state,
+                      double *delay_s) {
+    if (settings->compensation != BR_COMPENSATION_MEASURED) return;
+    int some = 0;
+    for (int i = 0; i < state->delays && i < BR_DELAYS; ++i) {
+        if (!(state->delays_s[i] >= 0)) continue; /* overtaken: it never acts */
+        delay->delays_s[delay->next_delay] = state->delays_s[i];
+        delay->next_delay = (delay->next_delay + 1) % BR_MEDIAN_OF;
+        if (delay->delays < BR_MEDIAN_OF) delay->delays += 1;
+        some = 1;
+    }
+    if (some) *delay_s = fmin(median(delay->delays_s, delay->delays), settings->longest_s);
+}
+
+static br_sent *sent(br_delay *delay, int i) { return &delay->sent[(delay->first + i) % BR_SENT]; }
+
+static void drop_first(br_delay *delay) {
+    delay->first = (delay->first + 1) % BR_SENT;
+    delay->count -= 1;
+}
+
+void br_delay_sent(br_delay *delay, double decided_at_s, const double u[BR_NU]) {
+    if (delay->count == BR_SENT) drop_first(delay);
+    br_sent *one = sent(delay, delay->count++);
+    one->decided_at_s = decided_at_s;
+    memcpy(one->u, u, sizeof one->u);
+}
+
+/* x and u when an input decided at that plant time begins to act; -1 if the model cannot follow. */
+int br_delay_at_acting(br_delay *delay, const br_driving *settings, const br_controller *controller,
+                       const br_measured *state, double decided_at_s, double delay_s,
+                       double x[BR_NX], double u[BR_NU]) {
+    double now_s = state->time_s;
+    const double end_s = fmin(decided_at_s + delay_s, now_s + settings->longest_s);
+    memcpy(x, state->x, sizeof state->x);
+    memcpy(u, state->u_applied, sizeof state->u_applied);
+    if (settings->compensation == BR_COMPENSATION_OFF) return 0;
+    while (delay->count > 1 && sent(delay, 1)->decided_at_s + delay_s <= now_s)
+        drop_first(delay); /* has stopped acting */
+    for (int i = 0; i < delay->count; ++i) {
+        const br_sent *one = sent(delay, i);
+        const double from_s = one->decided_at_s + delay_s;
+        if (from_s >= end_s) break;
+        if (from_s > now_s) {
+            if (controller->predict(controller->self, x, u, from_s - now_s, x)) return -1;
+            now_s = from_s;
+        }
+        memcpy(u, one->u, sizeof one->u);
+    }
+    if (end_s <= now_s) return 0;
+    return controller->predict(controller->self, x, u, end_s - now_s, x) ? -1 : 0;
 }
 
 #endif
