@@ -17,7 +17,7 @@ from fmpy.model_description import (
 )
 
 from bayesrace.arrays import Floats
-from bayesrace.plant.fmu.units import unit_of
+from bayesrace.plant.fmu.inspection import unit_of
 from bayesrace.plant.fmu.wiring import STATES, Wiring
 
 __all__ = [

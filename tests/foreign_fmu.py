@@ -8,6 +8,9 @@ from typing import Final
 __all__ = ["FOREIGN_MAP", "build_foreign_fmu"]
 
 FOREIGN_MAP: Final = """\
+[fmu]
+derived = ["delta"]
+
 [inputs]
 PedalPercent = { from = "d", unit = "%" }
 SteerAngleCmd = { from = "delta", unit = "deg", sign = -1 }
@@ -15,20 +18,16 @@ SteerAngleCmd = { from = "delta", unit = "deg", sign = -1 }
 [outputs]
 x = { variable = "posEast", unit = "cm" }
 y = { variable = "posNorth", unit = "cm" }
-psi = { variable = "compass", unit = "deg", sign = -1, offset = "90 deg" }
+psi = { variable = "compass", unit = "deg", sign = -1, offset = 1.5707963267948966 }
 omega = { variable = "turnRate", unit = "deg/s", sign = -1 }
 
-[derive]
-delta = "delta_rate"
-
-[derive.velocity]
-world_x = { variable = "velEast", unit = "km/h" }
-world_y = { variable = "velNorth", unit = "km/h" }
+world_vx = { variable = "velEast", unit = "km/h" }
+world_vy = { variable = "velNorth", unit = "km/h" }
 
 [start]
 startEast = { from = "x", unit = "cm" }
 startNorth = { from = "y", unit = "cm" }
-startCompass = { from = "psi", unit = "deg", sign = -1, offset = "90 deg" }
+startCompass = { from = "psi", unit = "deg", sign = -1, offset = 90 }
 startSpeed = { from = "vx", unit = "km/h" }
 """
 

@@ -27,8 +27,8 @@ def test_it_drives_as_the_built_in_car(foreign: Path, tmp_path: Path, settings: 
     """Turning left and right, several turns of heading, commands that change within a period."""
     car = get_car("orca")
     map_ = tmp_path / "map.toml"
-    patient = "timeout_s = 20\nstartup_s = 60"
-    map_.write_text(f"[fmu]\n{patient}\n{settings}\n{FOREIGN_MAP}")
+    patient = f"[fmu]\ntimeout_s = 20\nstartup_s = 60\n{settings}"
+    map_.write_text(FOREIGN_MAP.replace("[fmu]", patient))
     ours = Simulator(dynamic(car))
     with open_fmu(car, foreign, map_) as theirs:
         for run in range(2):  # the second one starts afresh

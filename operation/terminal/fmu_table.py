@@ -10,8 +10,7 @@ from rich.table import Table
 from rich.text import Text
 
 from bayesrace.operation.terminal import printable
-from bayesrace.plant.fmu.inspection import items_of, range_of, steps_s
-from bayesrace.plant.fmu.units import unit_of
+from bayesrace.plant.fmu.inspection import items_of, range_of, steps_s, unit_of
 
 __all__ = ["FmuTable"]
 

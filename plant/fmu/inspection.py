@@ -1,6 +1,8 @@
-"""An FMU file: its description read, a map to fill in written, and its content unpacked.
+"""An FMU file: its description read, a map to fill in written, its content unpacked; units.
 
-Every fault of the file is an InputError.
+Every fault of the file is an InputError. Pint knows the names of units that an FMU declares or a
+map names. It takes an angle for a plain number; here the two differ, because a duty cycle in
+degrees is a mistake.
 """
 
 import json
@@ -8,8 +10,10 @@ import math
 import re
 import zipfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cache
 from pathlib import Path, PurePosixPath
 from string import Template
 from typing import Any, Final
@@ -18,12 +22,11 @@ from fmpy import platform, platform_tuple, read_model_description, sharedLibrary
 from fmpy.simulation import settable_in_instantiated
 
 from bayesrace.errors import InputError
-from bayesrace.plant.fmu.units import unit_of
 from bayesrace.plant.fmu.wiring import COMMANDS, STATES
 
 __all__ = [
-    "blank_map", "extract", "inspect", "is_readable", "is_real", "is_settable", "items_of",
-    "library", "platforms", "range_of", "steps_s",
+    "FREQUENCY", "Unit", "blank_map", "extract", "inspect", "is_readable", "is_real", "is_settable",
+    "items_of", "library", "platforms", "range_of", "steps_s", "to_si", "unit_of",
 ]  # fmt: skip
 
 _MOST_BYTES: Final = 2 << 30
@@ -31,6 +34,12 @@ _MOST_BYTES: Final = 2 << 30
 
 _LARGEST_XML: Final = 16_000_000
 """Bytes of a model description; a hundred thousand variables."""
+
+_SPELLED: Final = re.compile(r"(?:[^\W\d]+|[°%·²³()\s]|\*(?!\*)|/|\^-?\d(?!\d)|1(?=\s*/|$))+")
+"""Units, products and powers of one digit: pint computes what it is given, 9^9^9 for days."""
+
+FREQUENCY: Final = {"second": -1.0}
+"""Powers of a unit such as 1/min, which leaves open what it counts."""
 
 _CONTROL: Final = re.compile(r"[\x00-\x1f\x7f\x85\u2028\u2029]+")
 
@@ -41,17 +50,12 @@ _MAP: Final = Template("""\
 [fmu]
 # step_s = $step_s  # communication step; must divide the plant's period
 # placed = true  # if it starts at an origin of its own
+# derived = ["omega", "delta"]  # if it does not give them
 
 [inputs]  # from: d, throttle, brake, delta_rate, delta; or a constant
 $input
-[outputs]
+[outputs]  # world_vx and world_vy, or speed and slip, can stand in place of vx and vy
 $output
-[derive]  # what the FMU does not give and follows from other outputs
-# psi = { cos = "", sin = "" }  # or { quaternion = { w = "", x = "", y = "", z = "" } }
-# velocity = { world_x = "", world_y = "" }  # or { speed = "", slip = "" }
-# omega = "psi"
-# delta = "delta_rate"
-
 [start]  # outputs whose start can be set are started without being named here
 # start_x = { from = "x", unit = "m" }
 
@@ -223,3 +227,61 @@ def library(path: Path, folder: Path, fmu: Any) -> Path:
         f"{path} is for {platforms(path)}, not for this computer, {platform_tuple}: export it with "
         f"binaries/{fits[-1]}/{name}"
     )
+
+
+@dataclass(frozen=True, slots=True)
+class Unit:
+    """A unit by name, as a multiple of powers of pint's base units, radian among them."""
+
+    name: str
+    factor: float
+    powers: Mapping[str, float]
+
+    def agrees(self, other: "Unit") -> bool:
+        """Whether both measure the same, an angle left open by one of them included."""
+        plain = [{k: v for k, v in one.powers.items() if k != "radian"} for one in (self, other)]
+        return plain[0] == plain[1] and math.isclose(self.factor, other.factor, rel_tol=1e-4)
+
+
+@cache
+def _registry() -> Any:
+    import pint  # takes half a second, and the built-in car needs none of it
+
+    registry: Any = pint.UnitRegistry()
+    registry.define("@alias kilometer_per_hour = kmph")  # or it reads as thousands of mph
+    registry.define("@alias turn = rev")
+    return registry
+
+
+@cache
+def unit_of(name: str | None) -> Unit | None:
+    """The unit called ``name``, also as FMI tools spell it (N.m, m/s2, rad.s-1); None if it is not
+    known."""
+    spelled = re.sub(r"([^\W\d_])(-?\d+)", r"\1^\2", (name or "").strip().replace(".", "*"))
+    if not name or len(name) > 60 or not _SPELLED.fullmatch(spelled):
+        return None
+    try:
+        one = _registry().Quantity(1.0, spelled).to_root_units()
+        powers = {str(base): float(power) for base, power in one.unit_items()}
+        factor = float(one.magnitude)
+    except Exception:  # pint raises what its tokenizer, parser and converters raise
+        return None
+    return Unit(name, factor, powers) if math.isfinite(factor) else None
+
+
+def to_si(unit: Unit, wanted: str) -> float:
+    """Factor from a value in ``unit`` to one in the SI unit ``wanted``.
+
+    Raises InputError for another dimension, and for a frequency that may count turns or radians.
+    """
+    si = unit_of(wanted)
+    assert si is not None, wanted  # noqa: S101  the car's own units are known
+    same = "radian" not in unit.powers and unit.agrees(si)  # 1 and 1/s are radians, as SI has them
+    if unit.powers == si.powers or (same and "Hz" not in unit.name):
+        return unit.factor / si.factor
+    if unit.powers == FREQUENCY and wanted == "rad/s":
+        raise InputError(
+            f'\'{unit.name}\' may count turns or radians: say unit = "rpm", "rad/min" or the like'
+        )
+    target = "a plain number" if wanted == "1" else f"'{wanted}'"
+    raise InputError(f"'{unit.name}' does not convert to {target}")

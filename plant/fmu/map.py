@@ -1,35 +1,156 @@
-"""A map checked against an FMU: what fits becomes a :class:`~bayesrace.plant.fmu.wiring.Wiring`.
+"""The map of an FMU: TOML that says which of its variables mean what, checked against the FMU.
 
-One error names all that is missing or wrong, each with what to write into the map instead. Units
-become factors here, and constants get the type of their variable.
+``ours = sign * scale * theirs + offset`` for outputs, ``theirs = sign * scale * ours + offset``
+for inputs and start values; the scale follows from the unit unless it is given.
+
+What fits becomes a :class:`~bayesrace.plant.fmu.wiring.Wiring`; constants get the type of their
+variable. One error names all that is missing or wrong, each with what to write instead.
 """
 
 import difflib
+import math
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any, Final
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Final, Literal, Self
 
 import numpy as np
+import pydantic
+from pydantic import Discriminator, Field, Tag, model_validator
 
-from bayesrace.errors import InputError
+from bayesrace.errors import InputError, faults_in
+from bayesrace.files import parse_toml, read_text
 from bayesrace.plant.fmu.inspection import (
+    FREQUENCY,
     is_readable,
     is_real,
     is_settable,
     items_of,
     range_of,
+    to_si,
+    unit_of,
 )
-from bayesrace.plant.fmu.map_file import Driven, FmuMap, Pick, Value
-from bayesrace.plant.fmu.units import FREQUENCY, parse_quantity, to_si, unit_of
-from bayesrace.plant.fmu.wiring import COMMANDS, READINGS, STARTS, STATES, Link, Wiring
+from bayesrace.plant.fmu.wiring import COMMANDS, QUANTITIES, STATES, VELOCITIES, Link, Wiring
 
-__all__ = ["wire"]
+__all__ = ["FmuMap", "parse_map", "read_map", "wire"]
 
-_VELOCITY: Final = "velocity = { world_x, world_y } or { speed, slip }"
-_RULES: Final = {
-    "psi": "psi = { cos, sin } or { quaternion = { w, x, y, z } }", "vx": _VELOCITY,
-    "vy": _VELOCITY, "omega": 'omega = "psi"', "delta": 'delta = "delta_rate"',
-}  # fmt: skip
-"""What [derive] can say instead of [outputs]."""
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, bool | int | str) or (isinstance(value, float) and math.isfinite(value)):
+        return value
+    raise ValueError("give a finite number, true, false or a text")
+
+
+Value = Annotated[bool | int | float | str, pydantic.PlainValidator(_plain)]
+Sign = Literal[1, -1]
+
+
+class _Section(pydantic.BaseModel):
+    model_config = pydantic.ConfigDict(
+        frozen=True, extra="forbid", allow_inf_nan=False, populate_by_name=True
+    )
+
+
+class _Affine(_Section):
+    named: ClassVar[str]
+    """The key of the text that will do alone."""
+
+    unit: str | None = Field(None, description="the FMU variable's unit; default: as it declares")
+    sign: Sign = Field(1, description="-1: positive the other way round; a factor is `scale`")
+    scale: float | None = Field(None, description="factor in place of the unit's")
+    offset: float = Field(0.0, description="added after scaling, in the unit of the result")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _short(cls, entry: Any) -> Any:
+        if isinstance(entry, dict | cls):
+            return entry
+        if isinstance(entry, str):
+            return {cls.named: entry}
+        raise ValueError('give the name of a variable of the FMU, or { variable = "name", … }')
+
+    @model_validator(mode="after")
+    def _one_conversion(self) -> Self:
+        if self.scale == 0.0:
+            raise ValueError("scale is 0, which loses the value")
+        if self.scale is not None and self.unit is not None:
+            raise ValueError(
+                "unit and scale both convert: give one of them (the other way round: sign = -1)"
+            )
+        return self
+
+
+class Pick(_Affine):
+    """One of the FMU's variables, as a quantity of ours."""
+
+    named = "variable"
+    variable: str
+
+
+class Driven(_Affine):
+    """The quantity of ours that sets one of the FMU's variables."""
+
+    named = "from"
+    source: str = Field(alias="from")
+
+
+def _form(entry: Any) -> str:
+    """A quantity, by a table or by its name alone, or else a constant."""
+    named = isinstance(entry, dict | Driven) or entry in (*COMMANDS, *QUANTITIES)
+    return "driven" if named else "constant"
+
+
+Setting = Annotated[
+    Annotated[Driven, Tag("driven")] | Annotated[Value, Tag("constant")], Discriminator(_form)
+]
+
+
+class FmuSection(_Section):
+    """[fmu]: how the FMU is run."""
+
+    step_s: float | None = Field(None, gt=0, description="communication step; must divide a period")
+    timeout_s: float = Field(2.0, gt=0, description="an FMU that takes longer for a step hangs")
+    startup_s: float = Field(
+        8.0, gt=0, description="the same for loading it, and for each initialisation"
+    )
+    placed: bool = Field(
+        False, description="move the FMU's world so that its own start is the asked start pose"
+    )
+    derived: frozenset[Literal["omega", "delta"]] = Field(
+        frozenset(),
+        description="what the FMU does not give: omega follows from the change of psi, delta is "
+        "the sum of the steering rates that acted",
+    )
+
+
+class FmuMap(_Section):
+    """A whole map; for what it leaves out, variables with our own names are taken."""
+
+    fmu: FmuSection = FmuSection()
+    inputs: dict[str, Setting] = {}
+    outputs: dict[
+        Literal[
+            "x", "y", "psi", "vx", "vy", "omega", "delta", "world_vx", "world_vy", "speed", "slip"
+        ],
+        Pick,
+    ] = {}
+    parameters: dict[str, Value] = {}
+    start: dict[str, Setting] = {}
+
+
+def parse_map(text: str, name: str = "map") -> FmuMap:
+    """The map written in TOML; InputError naming ``name`` and every fault."""
+    content = parse_toml(text, name, "names with dots need quotes")
+    try:
+        return FmuMap.model_validate(content)
+    except pydantic.ValidationError as error:
+        faults = faults_in(error, "the map", FmuMap, ("driven", "constant"))
+        raise InputError(f"{name}: {faults}; docs/fmu.md has the form") from None
+
+
+def read_map(path: Path) -> FmuMap:
+    """The map in a file; InputError if it cannot be read or is not one."""
+    return parse_map(read_text(path, "the map"), str(path))
+
 
 _NEEDED: Final = (
     ("the drive command d or its part `throttle`", ["d"], {"d", "throttle"}),
@@ -77,7 +198,6 @@ class _Matching:
         self._outputs: list[Link] = []
         self._starts: list[Link] = []
         self._fixed: dict[str, Value] = {}
-        self._heading = (1.0, 0.0)
         self.problems: list[str] = []
 
     def wiring(self, commands: Mapping[str, str]) -> Wiring:
@@ -85,21 +205,15 @@ class _Matching:
         map_ = self._map
         for quantity, pick in self._states():
             self._try(f"[outputs] {quantity}", self._output, quantity, pick)
-        for quantity, place, pick in map_.derive.picks("[derive] "):
-            self._try(place, self._output, quantity, pick)
-        if rule := map_.derive.psi:
-            self._try("[derive] psi", self._turned, rule.sign, rule.offset)
         for section, entries, quantities in (
             ("inputs", map_.inputs | self._own_inputs(), commands),
             ("parameters", map_.parameters, {}),
-            ("start", map_.start, STARTS),
+            ("start", map_.start, QUANTITIES),
         ):
             for name, entry in entries.items():
                 self._try(f"[{section}] {name}", self._setting, section, name, entry, quantities)
         starts = [*self._starts, *self._started_outputs()]
-        return Wiring(
-            self._inputs, self._outputs, starts, self._fixed, self._heading, map_.fmu.placed
-        )
+        return Wiring(self._inputs, self._outputs, starts, self._fixed, map_.fmu.placed)
 
     def _try(self, where: str, check: Callable[..., None], *arguments: object) -> None:
         try:
@@ -108,21 +222,31 @@ class _Matching:
             self.problems.append(f"{where}: {error}")
 
     def _states(self) -> Iterator[tuple[str, Pick]]:
-        """[outputs], and our own names where neither it nor [derive] says anything."""
-        derived, outputs = self._map.derive.derived(), dict[str, Pick](self._map.outputs.items())
-        for quantity, unit in STATES.items():
-            own = self._variables.get(quantity)
-            if quantity in derived:
-                if quantity in outputs:
-                    self.problems.append(f"{quantity} is in [outputs] and in [derive]: give one")
-            elif quantity in outputs or (own and is_readable(own)):
-                yield quantity, outputs.get(quantity, Pick(variable=quantity))
-            else:
-                rule = f" or [derive] {_RULES[quantity]}" if quantity in _RULES else ""
+        """[outputs], and our own names where the map says nothing else."""
+        outputs = dict[str, Pick](self._map.outputs.items())
+        replaced = set[str](self._map.fmu.derived)
+        if others := outputs.keys() - STATES.keys():
+            replaced |= {"vx", "vy"}
+            if others not in VELOCITIES:
                 self.problems.append(
-                    f"nothing gives our {quantity} [{unit}]: add [outputs] {quantity} = "
-                    f'{{ variable = "…", unit = "{unit}" }}{rule}'
+                    "[outputs] in place of vx and vy: give world_vx and world_vy, or speed and "
+                    "slip, or speed alone, where the car moves where it points"
                 )
+        for quantity in sorted(outputs.keys() & replaced):
+            self.problems.append(
+                f"[outputs] {quantity} also follows from other entries of the map: remove one"
+            )
+        yield from outputs.items()
+        for quantity in [one for one in STATES if one not in {*outputs, *replaced}]:
+            own, unit = self._variables.get(quantity), STATES[quantity]
+            if own and is_readable(own):
+                yield quantity, Pick(variable=quantity)
+                continue
+            rule = f", or [fmu] derived = ['{quantity}']" if quantity in ("omega", "delta") else ""
+            self.problems.append(
+                f"nothing gives our {quantity} [{unit}]: add [outputs] {quantity} = "
+                f'{{ variable = "…", unit = "{unit}" }}{rule}'
+            )
 
     def _own_inputs(self) -> dict[str, Driven | Value]:
         """Drive and steering by our own names; what nothing sets needs a start value of its own."""
@@ -161,17 +285,11 @@ class _Matching:
     def _output(self, quantity: str, pick: Pick) -> None:
         variable = self._real(pick.variable)
         if not is_readable(variable):
-            rule = f", or [derive] {_RULES[quantity]}" if quantity in _RULES else ""
             raise InputError(
-                f"'{variable.name}' is of causality {variable.causality}: give an output{rule}"
+                f"'{variable.name}' is of causality {variable.causality}: give an output"
             )
-        factor = self._factor(pick, variable, READINGS[quantity])
-        offset = _offset(pick.offset, READINGS[quantity])
-        self._outputs.append(Link(variable.name, quantity, pick.sign * factor, offset))
-
-    def _turned(self, sign: float, offset: float | str) -> None:
-        """Turns a derived heading."""
-        self._heading = sign, _offset(offset, "rad")
+        factor = self._factor(pick, variable, QUANTITIES[quantity])
+        self._outputs.append(Link(variable.name, quantity, pick.sign * factor, pick.offset))
 
     def _setting(
         self, section: str, name: str, entry: Driven | Value, quantities: Mapping[str, str]
@@ -194,8 +312,8 @@ class _Matching:
         wanted, links = quantities[entry.source], self._inputs if home == "inputs" else self._starts
         scale = self._factor(entry, self._real(name), wanted)
         scale = scale if entry.scale else 1.0 / scale
-        offset = _offset(entry.offset, wanted, abs(scale))
-        links.append(Link(name, entry.source, entry.sign * scale, offset, *range_of(variable)))
+        sign, offset = entry.sign, entry.offset
+        links.append(Link(name, entry.source, sign * scale, offset, *range_of(variable)))
 
     def _find(self, name: str) -> Any:
         """The FMU's variable; InputError with names like it if there is none."""
@@ -235,15 +353,6 @@ class _Matching:
 
     def _constant(self, variable: Any, value: Value) -> Value:
         """``value`` in the variable's type; InputError if it is of another or out of range."""
-        own = unit_of(variable.unit)
-        if isinstance(value, str) and is_real(variable):
-            number, unit = parse_quantity(value)
-            if own is None or own.powers != unit.powers:
-                raise InputError(
-                    f"'{value}' does not convert to "
-                    + (f"'{own.name}'" if own else "a number: the FMU declares no unit of it")
-                )
-            value = number * unit.factor / own.factor
         result = None if variable.dimensions else _typed(variable, value)
         lowest, highest = range_of(variable)
         if result is None:
@@ -257,17 +366,6 @@ class _Matching:
         raise InputError(
             f"{value!r} is outside {lowest:g} to {highest:g}, which '{variable.name}' allows"
         )
-
-
-def _offset(offset: float | str, wanted: str, factor: float = 1.0) -> float:
-    """An offset as a number; a text is in a unit of its own and converts to ``wanted``."""
-    if not isinstance(offset, str):
-        return offset
-    try:
-        number, unit = parse_quantity(offset)
-        return number * to_si(unit, wanted) * factor
-    except InputError as error:
-        raise InputError(f"offset: {error}") from None
 
 
 def _typed(variable: Any, value: Value) -> Value | None:

@@ -10,8 +10,7 @@ from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
 from bayesrace.plant.fmu.host import FmuHost
 from bayesrace.plant.fmu.inspection import inspect, steps_s
-from bayesrace.plant.fmu.map import wire
-from bayesrace.plant.fmu.map_file import FmuMap, read_map
+from bayesrace.plant.fmu.map import FmuMap, read_map, wire
 from bayesrace.plant.fmu.wiring import Wiring
 from bayesrace.plant.guard import Command
 from bayesrace.plant.simulator import plant_discretisation

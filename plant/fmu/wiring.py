@@ -1,9 +1,9 @@
 """The car's quantities as an FMU's variables, by arithmetic alone.
 
 Every value that passes is affine, ``scale * value + offset``: a row (:class:`Link`) for each
-variable of the FMU. A few rules derive the state from what the rows read: the heading from a
-quaternion or from cosine and sine, continued by whole turns; body velocities from world velocities
-or from speed and slip angle; the yaw rate from the heading; the steering angle from the rate.
+variable of the FMU. A few rules derive the state from what the rows read: the heading is continued
+by whole turns; body velocities follow from world velocities or from speed and slip angle, the yaw
+rate from the heading, the steering angle from the rate.
 """
 
 import math
@@ -16,7 +16,7 @@ import numpy as np
 from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
 
-__all__ = ["COMMANDS", "READINGS", "STARTS", "STATES", "Link", "Value", "Wiring"]
+__all__ = ["COMMANDS", "QUANTITIES", "STATES", "VELOCITIES", "Link", "Value", "Wiring"]
 
 Value = float | int | bool | str
 
@@ -38,16 +38,14 @@ COMMANDS: Final = {
 positive) negative part, in the unit of the car's drive, here that of a duty cycle; and the steering
 rate or the steering angle at the end of the hold."""
 
-_QUATERNION: Final = dict.fromkeys(("qw", "qx", "qy", "qz"), "1")
-_POLAR: Final = {"speed": "m/s", "slip": "rad"}
+QUANTITIES: Final = STATES | {
+    "world_vx": "m/s", "world_vy": "m/s", "speed": "m/s", "slip": "rad",
+}  # fmt: skip
+"""What an FMU's outputs can mean and what can set its start values, with units; world_* are
+velocities along the axes of x and y."""
 
-STARTS: Final = STATES | _POLAR | {"world_vx": "m/s", "world_vy": "m/s"} | _QUATERNION
-"""What can set an FMU's start value, with units; q* is the heading as a quaternion."""
-
-READINGS: Final = (
-    STATES | _POLAR | {"world_x": "m/s", "world_y": "m/s", "cos": "1", "sin": "1"} | _QUATERNION
-)
-"""What an FMU's outputs can mean, with units; world_* are velocities along the axes of x and y."""
+VELOCITIES: Final = ({"world_vx", "world_vy"}, {"speed", "slip"}, {"speed"})
+"""What an FMU's outputs can give in place of vx and vy."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,13 +95,11 @@ class Wiring:
         outputs: Sequence[Link],
         starts: Sequence[Link] = (),
         fixed: Mapping[str, Value] | None = None,
-        heading: tuple[float, float] = (1.0, 0.0),
         placed: bool = False,
     ) -> None:
-        """``inputs`` link to :data:`COMMANDS`, ``outputs`` to :data:`READINGS`, ``starts`` to
-        :data:`STARTS`; ``fixed`` are parameters and inputs that are set once, before
-        initialisation; ``heading``: sign and offset [rad] of one from a quaternion or from cosine
-        and sine; ``placed``: the FMU has a start of its own, which becomes the asked pose.
+        """``inputs`` link to :data:`COMMANDS`, ``outputs`` and ``starts`` to :data:`QUANTITIES`;
+        ``fixed`` are parameters and inputs that are set once, before initialisation; ``placed``:
+        the FMU has a start of its own, which becomes the asked pose.
         """
         self.inputs = tuple(link.variable for link in inputs)
         """The FMU's variables in the order in which values are passed; so ``outputs``."""
@@ -111,7 +107,7 @@ class Wiring:
         self.follows_angle = any(link.quantity == "delta" for link in inputs)
         """Whether an input changes during a hold because the steering angle does."""
         self._inputs, self._outputs, self._starts = inputs, outputs, starts
-        self._fixed, self._heading, self._placed = dict(fixed or {}), heading, placed
+        self._fixed, self._placed = dict(fixed or {}), placed
         self._psi, self._delta = 0.0, 0.0  # continued in the FMU's world, integrated
         self._turn, self._origin = 0.0, 0j  # of the FMU's world in ours
 
@@ -122,11 +118,10 @@ class Wiring:
         whose steering holds still. InputError for a start that the FMU's ranges do not allow.
         """
         ours = dict(zip(STATES, map(float, x0), strict=True))
-        velocity, half = complex(ours["vx"], ours["vy"]), ours["psi"] / 2.0
+        velocity = complex(ours["vx"], ours["vy"])
         world = velocity * _direction(ours["psi"])
         ours |= {"speed": abs(velocity), "slip": math.atan2(velocity.imag, velocity.real)}
         ours |= {"world_vx": world.real, "world_vy": world.imag}
-        ours |= {"qw": math.cos(half), "qx": 0.0, "qy": 0.0, "qz": math.sin(half)}
         still = dict(zip(self.inputs, self.to_inputs((0.0, 0.0), ours["delta"]), strict=True))
         return self._fixed | still | {one.variable: one.start(ours) for one in self._starts}
 
@@ -183,19 +178,12 @@ class Wiring:
         """What the rows and rules make of the outputs, in the FMU's world."""
         rows = zip(self._outputs, outputs, strict=True)
         ours = {one.quantity: one.scale * value + one.offset for one, value in rows}
-        if "qw" in ours:  # of any length; yaw is the z-y-x Euler angle
-            w, x, y, z = (ours[name] for name in _QUATERNION)
-            ours["sin"], ours["cos"] = 2.0 * (w * z + x * y), w * w + x * x - y * y - z * z
-        if "cos" in ours:
-            sine, cosine = ours["sin"], ours["cos"]
-            angle = math.nan if sine == cosine == 0.0 else math.atan2(sine, cosine)
-            ours["psi"] = self._heading[0] * angle + self._heading[1]
         turns = (self._psi - ours["psi"]) / TURN
         # Nothing is added where the FMU counts turns itself: its value stays to the bit.
         self._psi = ours["psi"] + TURN * round(turns) if math.isfinite(turns) else math.nan
         velocity = None
-        if "world_x" in ours:
-            velocity = complex(ours["world_x"], ours["world_y"]) * _direction(-self._psi)
+        if "world_vx" in ours:
+            velocity = complex(ours["world_vx"], ours["world_vy"]) * _direction(-self._psi)
         elif "speed" in ours:
             velocity = ours["speed"] * _direction(ours.get("slip", 0.0))
         if velocity is not None:
