@@ -7,7 +7,7 @@ from pathlib import Path
 
 from bayesrace.errors import InputError
 from bayesrace.messages import EVENT, Event, RunRequest, Scalar
-from bayesrace.operation.analysis.verdict import Verdict, judge_log
+from bayesrace.operation.analysis.laps import Verdict, judge_log
 from bayesrace.raceline import same_track
 from bayesrace.recorder import Recorder
 from bayesrace.tracks import StartLine, Track
@@ -89,7 +89,7 @@ def execute(
 ) -> Event:
     """Announces and starts the run and waits for its end; the plant's ``run_ended`` event.
 
-    How the car was driven is for :func:`bayesrace.operation.analysis.verdict.judge`. InputError if
+    How the car was driven is for :func:`bayesrace.operation.analysis.laps.judge`. InputError if
     the controller drives another track, the plant refuses, the recorder fails, or the run ended by
     anything but its laps, its time limit or the car's leaving the world, or several plants or
     controllers of one name are there, before or after; KeyboardInterrupt on a signal.

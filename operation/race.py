@@ -4,13 +4,16 @@ Plant and controller are processes of their own, started as a person would start
 directs, records every message on the network, and hands over weights.
 """
 
+import os
 import shutil
-from collections.abc import Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass, replace
+import time
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
+from bayesrace.cache import note_use
 from bayesrace.codegen.compiler import find_compiler
 from bayesrace.columns import LogColumns
 from bayesrace.errors import InputError
@@ -18,10 +21,16 @@ from bayesrace.files import claimed, write_whole
 from bayesrace.gp.weights import read_weights
 from bayesrace.learning.dataset import Dataset
 from bayesrace.learning.sources import dataset_from_columns
+from bayesrace.limit import LimitSettings, known_limit, write_limit
 from bayesrace.manifest import MANIFEST
-from bayesrace.operation.analysis.recording import RUN_COLUMNS, Recording, read_recording, runs_of
+from bayesrace.operation.analysis.recording import (
+    LIMIT_FILES,
+    RUN_COLUMNS,
+    Recording,
+    read_recording,
+    runs_of,
+)
 from bayesrace.operation.drive import RunPlan
-from bayesrace.operation.limits import limits_beside
 from bayesrace.operation.preparation import (
     PredictionModel,
     Prepared,
@@ -31,8 +40,8 @@ from bayesrace.operation.preparation import (
     updated_weights,
 )
 from bayesrace.operation.settings import RaceSettings
-from bayesrace.operation.system import System, started_system
-from bayesrace.operation.terminal.terminal import Stage, Stages
+from bayesrace.operation.system import Child, System, child, started_system
+from bayesrace.operation.terminal.terminal import Stages
 from bayesrace.plant.simulator import PLANT
 from bayesrace.plant.vehicle import FmuFault, open_vehicle
 from bayesrace.recorder import Recorder
@@ -40,114 +49,23 @@ from bayesrace.tracks import load_track
 from bayesrace.transport import RefusedError
 from bayesrace.vehicles import write_car
 
-__all__ = ["FILES", "RaceError", "race"]
+__all__ = ["RaceError", "race"]
 
 _MODELS: Final[tuple[PredictionModel, ...]] = ("e_kinematic", "dynamic")
 """Of BayesRace and of BestCase."""
 
+_PATIENCE_S: Final = 60.0
+"""For the limits, once all else is prepared."""
+
+_LOWEST: Final = 19
+
+_LOG: Final = "run.mcap"
+_CAR: Final = "car.toml"
+_FMU_COPIES: Final = {"fmu": "car.fmu", "fmu_map": "car-map.toml"}
+
 
 class RaceError(RuntimeError):
     """The race could not be driven to its end; the message says why. The log is readable."""
-
-
-@dataclass(frozen=True)
-class _Files:
-    """Names in the run directory."""
-
-    settings: str = "settings.json"
-    car: str = "car.toml"
-    log: str = "run.mcap"
-    collect_log: str = "collect.mcap"
-    weights: str = "weights-bayesrace.bin"
-    weights_updated: str = "weights-updated.bin"
-    weights_limit: str = "weights-limit.bin"
-    mpc: str = "mpc.json"
-    fmu: str = "car.fmu"
-    fmu_map: str = "car-map.toml"
-
-
-FILES: Final = _Files()
-
-
-class _Race:
-    def __init__(self, settings: RaceSettings, out: Path, stages: Stages) -> None:
-        self.settings, self.out, self.stages = settings, out, stages
-        self.car = settings.driven_car
-        self.car_file = str(out / FILES.car)
-        """The car, as the processes read it."""
-        # Nothing predicts with what is inside another simulator.
-        self.models = _MODELS if settings.simulator == "equations" else _MODELS[:1]
-        self.lockstep = settings.mode == "lockstep"
-        self._run = 0
-
-    # Preparation -------------------------------------------------------------------------------
-
-    def prepare(self) -> Prepared:
-        """Everything made, or taken from the cache; copies in the run directory."""
-        settings = self.settings
-        with _faults_named():
-            prepared = prepare(settings, (settings.track,), self.stages, self.models, settings.line)
-        if prepared.training is not None:
-            self._keep_files(prepared.training.driven_on, "train")
-            shutil.copyfile(prepared.training.log, self.out / FILES.collect_log)
-        kept = self._keep_files(prepared.first, "race")
-        for model, folder in zip(self.models, prepared.artefacts, strict=True):
-            shutil.copyfile(folder / MANIFEST, self.out / f"manifest-{model}.json")
-        shutil.copyfile(prepared.weights, self.out / FILES.weights)
-        return replace(prepared, tracks=(kept,), weights=self.out / FILES.weights)
-
-    def _keep_files(self, track: PreparedTrack, label: str) -> PreparedTrack:
-        files = self.out / f"{label}.csv", self.out / f"{label}_raceline.csv"
-        shutil.copyfile(track.track_file, files[0])
-        shutil.copyfile(track.line_file, files[1])
-        return PreparedTrack(track.track, track.line, *files)
-
-    def keep_fmu(self) -> None:
-        """Copies FMU and map, if there are any, into the run directory, and tries them there."""
-        settings, names = self.settings, {"fmu": FILES.fmu, "fmu_map": FILES.fmu_map}
-        given = {name: file for name in names if (file := getattr(settings, name)) is not None}
-        copies = {
-            name: Path(shutil.copyfile(file, self.out / names[name]))
-            for name, file in given.items()
-        }
-        self.settings = settings = settings.model_copy(update=copies)
-        # An FMU that cannot be the car is reported now, not in half a minute.
-        files, rate_hz = (settings.fmu, settings.fmu_map), 1 / PLANT.step_s
-        with (
-            _faults_named(),
-            open_vehicle(self.car, *files, rate_hz, simulator=settings.simulator),
-        ):
-            pass
-
-    @property
-    def plant_options(self) -> list[str]:
-        """Of ``bayesrace plant``."""
-        settings = self.settings
-        files = ("--fmu", settings.fmu), ("--map", settings.fmu_map)
-        noise = [("--noise", f"{name}={value!r}") for name, value in settings.noise if value]
-        pairs = [
-            ("--car", self.car_file), ("--simulator", settings.simulator),
-            *(pair for pair in files if pair[1]), *noise,
-            ("--delay", 1e3 * settings.delay_s), ("--seed", settings.seed),
-        ]  # fmt: skip
-        return [str(one) for pair in pairs for one in pair]
-
-    def update(self, samples: Sequence[Dataset], weights: Path, name: str, stage: Stage) -> Path:
-        """Weights learned from all samples, beginning with ``weights``, as that file."""
-        first = read_weights(weights)
-        learned = updated_weights(samples, self.settings, first, stage.update)
-        return Path(shutil.copyfile(learned, self.out / name))
-
-    # Driving -----------------------------------------------------------------------------------
-
-    def plan(self, controller: str, track: PreparedTrack) -> RunPlan:
-        """The next run."""
-        self._run += 1
-        settings = self.settings
-        limit_s = settings.limit_s(track.line.lap_time_s)
-        return RunPlan(
-            self._run, controller, settings.laps, limit_s, self.lockstep, settings.start_speed_mps
-        )
 
 
 @contextmanager
@@ -157,62 +75,6 @@ def _faults_named(fault: type[Exception] = FmuFault) -> Iterator[None]:
         yield
     except fault as error:
         raise RaceError(str(error)) from error
-
-
-class _Drives:
-    """The runs of a race, driven and recorded one after the other."""
-
-    def __init__(
-        self, race: _Race, track: PreparedTrack, system: System, recorder: Recorder
-    ) -> None:
-        self._race, self._track = race, track
-        self._system, self._recorder = system, recorder
-        self.log = LogColumns(race.out / FILES.log, RUN_COLUMNS)
-
-    def controller(
-        self, artefact: Path, name: str, weights: Path | None = None
-    ) -> AbstractContextManager[None]:
-        """A controller process for the block; ready for its first run, with these weights."""
-        race, track = self._race, self._track
-        settings_file = race.out / FILES.mpc
-        write_whole(settings_file, race.settings.mpc.model_dump_json(indent=1) + "\n")
-        options = [
-            "--car", race.car_file, "--artefact", str(artefact), "--track", str(track.track_file),
-            "--raceline", str(track.line_file), "--settings", str(settings_file),
-            "--sensor-tolerance", str(race.settings.sensor_tolerance),
-        ]  # fmt: skip
-        if weights is not None:
-            options += ["--weights", str(weights)]
-        return self._system.controller(options, f"controller-{name}.log")
-
-    def drive(self, controller: str) -> RunPlan:
-        """One run; InputError if it broke off."""
-        plan = self._race.plan(controller, self._track)
-        self._system.drive(self._track.track, plan, self._recorder)
-        return plan
-
-    def drive_with(self, weights: Path, controller: str) -> RunPlan | None:
-        """One run with new weights; None, and the reason in the log, if they are refused."""
-        try:
-            self._system.director.send_weights(weights.read_bytes())
-        except RefusedError as refusal:
-            plan = self._race.plan(controller, self._track)
-            self._system.refused(plan, refusal.reply.text)
-            return None
-        return self.drive(controller)
-
-    def samples(self, plan: RunPlan) -> Dataset:
-        """What can be learned from a run, from the log; InputError names both."""
-        self._recorder.drain(at_most_s=20.0)
-        named = f"{self._race.out / FILES.log}, run {plan.run} ({plan.controller})"
-        record = runs_of(self.log.read()).get(plan.run)
-        if record is None:
-            raise InputError(f"{named}: the log does not hold it")
-        step_s = self._race.settings.discretisation.step_s
-        try:
-            return dataset_from_columns(record.states, record.telemetry, self._race.car, step_s)
-        except InputError as error:
-            raise InputError(f"{named}: {error}") from error
 
 
 def race(settings: RaceSettings, out: Path, stages: Stages) -> Recording:
@@ -226,7 +88,7 @@ def race(settings: RaceSettings, out: Path, stages: Stages) -> Recording:
     Raises InputError for unusable settings, RaceError when a process is lost (the log stays
     readable), KeyboardInterrupt on Ctrl-C; no process outlives the call.
     """
-    if (out / FILES.log).exists():
+    if (out / _LOG).exists():
         raise InputError(f"{out} holds a run already; choose another folder or remove it")
     if settings.true_grip != 1:
         raise InputError(
@@ -234,19 +96,17 @@ def race(settings: RaceSettings, out: Path, stages: Stages) -> Recording:
             "give a car with other tyres"
         )
     find_compiler()  # what is missing is reported now, before there is a run directory
-    this = _Race(settings, out, stages)
     for name in (settings.train_track, settings.track):
-        load_track(name, this.car.width_m)
+        load_track(name, settings.driven_car.width_m)
     with claimed(out):
-        return _compare(this)
+        return _compare(settings, out, stages)
 
 
-def _compare(this: _Race) -> Recording:
-    settings, out, stages = this.settings, this.out, this.stages  # as given, with no file copied
-    this.keep_fmu()
-    write_car(this.car_file, this.car)
-    write_whole(out / FILES.settings, settings.model_dump_json(indent=1) + "\n")
-    prepared = _prepared(this)
+def _compare(settings: RaceSettings, out: Path, stages: Stages) -> Recording:
+    copied = _with_copies(settings, out)
+    write_car(out / _CAR, settings.driven_car)
+    write_whole(out / "settings.json", settings.model_dump_json(indent=1) + "\n")
+    prepared = _prepared(copied, out, stages)
     artefact, *perfect = prepared.artefacts
     progress = None
     if settings.progress_runs:
@@ -254,64 +114,221 @@ def _compare(this: _Race) -> Recording:
             progress = progress_artefact(settings)
             shutil.copyfile(progress / MANIFEST, out / "manifest-progress.json")
     about = {"race": {"settings": settings.model_dump_json()}}
+    name, lockstep = settings.driven_car.name, settings.mode == "lockstep"
     with (
-        started_system(this.car.name, out, this.plant_options, lockstep=this.lockstep) as system,
-        Recorder(system.recording, this.car.name, out / FILES.log, about) as recorder,
+        started_system(name, out, _plant_options(copied, out), lockstep=lockstep) as system,
+        Recorder(system.recording, name, out / _LOG, about) as recorder,
         _faults_named(InputError),
     ):
-        drives = _Drives(this, prepared.first, system, recorder)
-        samples = [] if prepared.training is None else [prepared.training.samples]
+        drives = Drives(settings, out, stages, prepared, system, recorder)
         with drives.controller(artefact, "bayesrace"):
-            accepted = _learn(this, drives, samples, prepared.weights)
+            accepted = drives.learn()
         if progress is not None:
             with drives.controller(progress, "bayesrace-limit", accepted):
-                _approach_limit(this, drives, samples, accepted or prepared.weights)
+                drives.approach_limit(accepted or prepared.weights)
         for best in perfect:
             with drives.controller(best, "bestcase"), stages.stage("drive BestCase"):
                 drives.drive("bestcase")
     return read_recording(out, drives.log)
 
 
-def _prepared(this: _Race) -> Prepared:
-    """What the race needs, with the limits beside it."""
-    settings = this.settings
-    if not settings.compares_limit:
-        return this.prepare()
-    with limits_beside(settings, this.car_file, this.out) as wait:
-        prepared = this.prepare()
-        with this.stages.stage(f"limit, {prepared.first.track.name}"):
-            wait()
-    return prepared
+def _with_copies(settings: RaceSettings, out: Path) -> RaceSettings:
+    """The settings with copies of FMU and map, if there are any, which are tried: an FMU that
+    cannot be the car is reported now, not in half a minute."""
+    copies = {
+        name: Path(shutil.copyfile(file, out / copy))
+        for name, copy in _FMU_COPIES.items()
+        if (file := getattr(settings, name)) is not None
+    }
+    copied = settings.model_copy(update=copies)
+    simulated_by = copied.driven_car, copied.fmu, copied.fmu_map, 1 / PLANT.step_s
+    with _faults_named(), open_vehicle(*simulated_by, simulator=copied.simulator):
+        return copied
 
 
-def _learn(this: _Race, drives: _Drives, samples: list[Dataset], weights: Path) -> Path | None:
-    """WorstCase, BayesRace and BayesRace-updated; returns the last weights that the controller has
-    accepted, None without any."""
-    stages = this.stages
-    with stages.stage("drive WorstCase"):
-        driven = drives.drive("worstcase")
-    with stages.stage("drive BayesRace"):
-        first = drives.drive_with(weights, "bayesrace")
-    samples.append(drives.samples(first or driven))
-    with stages.stage("update the residual") as stage:
-        updated = this.update(samples, weights, FILES.weights_updated, stage)
-    with stages.stage("drive BayesRace-updated"):
-        if drives.drive_with(updated, "bayesrace-updated") is not None:
-            return updated
-    return weights if first is not None else None
+def _prepared(settings: RaceSettings, out: Path, stages: Stages) -> Prepared:
+    """What the race needs, made or taken from the cache, with the limits beside it; copies in the
+    run directory."""
+    # Nothing predicts with what is inside another simulator.
+    models = _MODELS if settings.simulator == "equations" else _MODELS[:1]
+    with _limits_beside(settings, out) as wait:
+        with _faults_named():
+            prepared = prepare(settings, (settings.track,), stages, models, settings.line)
+        if settings.compares_limit:
+            with stages.stage(f"limit, {prepared.first.track.name}"):
+                wait()
+    kept = _kept(prepared.first, out, "race")
+    if prepared.training is not None:
+        _kept(prepared.training.driven_on, out, "train")
+        shutil.copyfile(prepared.training.log, out / "collect.mcap")
+    for model, folder in zip(models, prepared.artefacts, strict=True):
+        shutil.copyfile(folder / MANIFEST, out / f"manifest-{model}.json")
+    weights = Path(shutil.copyfile(prepared.weights, out / "weights-bayesrace.bin"))
+    return replace(prepared, tracks=(kept,), weights=weights)
 
 
-def _approach_limit(this: _Race, drives: _Drives, samples: list[Dataset], weights: Path) -> None:
-    """The runs that maximise progress, the first with the weights that the controller has, with an
-    update before each other; ends where the controller refuses an update."""
-    driven: RunPlan | None = None
-    for number in range(1, this.settings.progress_runs + 1):
-        if driven is not None:
-            samples.append(drives.samples(driven))
-            with this.stages.stage(f"update the residual, {number}") as stage:
-                weights = this.update(samples, weights, FILES.weights_limit, stage)
-        with this.stages.stage(f"drive BayesRace-limit, {number}"):
-            name = "bayesrace-limit"
-            driven = drives.drive(name) if driven is None else drives.drive_with(weights, name)
-        if driven is None:
-            return
+@contextmanager
+def _limits_beside(settings: RaceSettings, out: Path) -> Iterator[Callable[[], None]]:
+    """The limits that the laps are compared with, in the run directory ``out`` before the first
+    drive begins: no control step is measured beside them.
+
+    Each is computed by ``bayesrace limit`` in a process of its own, at the lowest priority, beside
+    the block. Yields what waits for them, at most a minute. A limit that is not found is left out;
+    the reason is in a log named after it. The cache keeps it for the next race of the car on the
+    track.
+    """
+    track = load_track(settings.track, settings.driven_car.width_m)
+    with ExitStack() as stack:
+        children: list[Child] = []
+        for kind, name in LIMIT_FILES.items() if settings.compares_limit else ():
+            options = LimitSettings()
+            if kind == "standing":
+                options = LimitSettings(standing=True, start_speed_mps=settings.start_speed_mps)
+            known = known_limit(track, settings.driven_car, options)
+            if known is not None:
+                write_limit(out / name, known)
+                continue
+            arguments = [
+                "limit", settings.track, "--car", str(out / _CAR), "--out", str(out / name),
+                "--parent-pid", str(os.getpid()),
+            ]  # fmt: skip
+            if options.standing:
+                arguments += ["--standing", "--start-speed", repr(options.start_speed_mps)]
+            children.append(stack.enter_context(child(arguments, (out / name).with_suffix(".log"))))
+            with suppress(OSError):  # it has ended already
+                os.setpriority(os.PRIO_PROCESS, children[-1].pid, _LOWEST)
+
+        def wait() -> None:
+            deadline = time.monotonic() + _PATIENCE_S
+            for one in children:
+                one.wait(max(deadline - time.monotonic(), 0.0))
+            note_use(made=bool(children))
+
+        yield wait
+
+
+def _kept(track: PreparedTrack, out: Path, label: str) -> PreparedTrack:
+    """With copies of its files in the run directory."""
+    files = out / f"{label}.csv", out / f"{label}_raceline.csv"
+    shutil.copyfile(track.track_file, files[0])
+    shutil.copyfile(track.line_file, files[1])
+    return PreparedTrack(track.track, track.line, *files)
+
+
+def _plant_options(settings: RaceSettings, out: Path) -> list[str]:
+    """Of ``bayesrace plant``."""
+    files = ("--fmu", settings.fmu), ("--map", settings.fmu_map)
+    noise = [("--noise", f"{name}={value!r}") for name, value in settings.noise if value]
+    pairs = [
+        ("--car", out / _CAR), ("--simulator", settings.simulator),
+        *(pair for pair in files if pair[1]), *noise,
+        ("--delay", 1e3 * settings.delay_s), ("--seed", settings.seed),
+    ]  # fmt: skip
+    return [str(one) for pair in pairs for one in pair]
+
+
+class Drives:
+    """The runs of a race, driven and recorded one after the other."""
+
+    def __init__(
+        self,
+        settings: RaceSettings,
+        out: Path,
+        stages: Stages,
+        prepared: Prepared,
+        system: System,
+        recorder: Recorder,
+    ) -> None:
+        self._settings, self._out, self._stages = settings, out, stages
+        self._prepared, self._system, self._recorder = prepared, system, recorder
+        self._learned_from: list[Dataset] = []
+        if prepared.training is not None:
+            self._learned_from.append(prepared.training.samples)
+        self._run = 0
+        self.log = LogColumns(out / _LOG, RUN_COLUMNS)
+
+    def controller(
+        self, artefact: Path, name: str, weights: Path | None = None
+    ) -> AbstractContextManager[None]:
+        """A controller process for the block; ready for its first run, with these weights."""
+        settings_file, track = self._out / "mpc.json", self._prepared.first
+        write_whole(settings_file, self._settings.mpc.model_dump_json(indent=1) + "\n")
+        options = [
+            "--car", str(self._out / _CAR), "--artefact", str(artefact),
+            "--track", str(track.track_file), "--raceline", str(track.line_file),
+            "--settings", str(settings_file),
+            "--sensor-tolerance", str(self._settings.sensor_tolerance),
+        ]  # fmt: skip
+        if weights is not None:
+            options += ["--weights", str(weights)]
+        return self._system.controller(options, f"controller-{name}.log")
+
+    def drive(self, controller: str) -> RunPlan:
+        """One run; InputError if it broke off."""
+        plan = self._plan(controller)
+        self._system.drive(self._prepared.first.track, plan, self._recorder)
+        return plan
+
+    def learn(self) -> Path | None:
+        """WorstCase, BayesRace and BayesRace-updated; returns the last weights that the controller
+        has accepted, None without any."""
+        weights = self._prepared.weights
+        with self._stages.stage("drive WorstCase"):
+            driven = self.drive("worstcase")
+        with self._stages.stage("drive BayesRace"):
+            first = self._drive_with(weights, "bayesrace")
+        updated = self._updated(first or driven, weights, "weights-updated.bin")
+        with self._stages.stage("drive BayesRace-updated"):
+            if self._drive_with(updated, "bayesrace-updated") is not None:
+                return updated
+        return weights if first is not None else None
+
+    def approach_limit(self, weights: Path) -> None:
+        """The runs that maximise progress, the first with the weights that the controller has, with
+        an update before each other; ends where the controller refuses an update."""
+        driven: RunPlan | None = None
+        for number in range(1, self._settings.progress_runs + 1):
+            if driven is not None:
+                weights = self._updated(driven, weights, "weights-limit.bin", f", {number}")
+            with self._stages.stage(f"drive BayesRace-limit, {number}"):
+                name = "bayesrace-limit"
+                driven = self.drive(name) if driven is None else self._drive_with(weights, name)
+            if driven is None:
+                return
+
+    def samples(self, plan: RunPlan) -> Dataset:
+        """What can be learned from a run, from the log; InputError names both."""
+        self._recorder.drain(at_most_s=20.0)
+        named = f"{self._out / _LOG}, run {plan.run} ({plan.controller})"
+        record = runs_of(self.log.read()).get(plan.run)
+        if record is None:
+            raise InputError(f"{named}: the log does not hold it")
+        car, step_s = self._settings.driven_car, self._settings.discretisation.step_s
+        try:
+            return dataset_from_columns(record.states, record.telemetry, car, step_s)
+        except InputError as error:
+            raise InputError(f"{named}: {error}") from error
+
+    def _plan(self, controller: str) -> RunPlan:
+        self._run += 1
+        settings, lockstep = self._settings, self._settings.mode == "lockstep"
+        limit_s = settings.limit_s(self._prepared.first.line.lap_time_s)
+        start_mps = settings.start_speed_mps
+        return RunPlan(self._run, controller, settings.laps, limit_s, lockstep, start_mps)
+
+    def _drive_with(self, weights: Path, controller: str) -> RunPlan | None:
+        """One run with new weights; None, and the reason in the log, if they are refused."""
+        try:
+            self._system.director.send_weights(weights.read_bytes())
+        except RefusedError as refusal:
+            self._system.refused(self._plan(controller), refusal.reply.text)
+            return None
+        return self.drive(controller)
+
+    def _updated(self, driven: RunPlan, weights: Path, name: str, number: str = "") -> Path:
+        """Weights learned from a run and all samples before it, beginning with ``weights``."""
+        self._learned_from.append(self.samples(driven))
+        first = read_weights(weights)
+        with self._stages.stage(f"update the residual{number}") as stage:
+            learned = updated_weights(self._learned_from, self._settings, first, stage.update)
+            return Path(shutil.copyfile(learned, self._out / name))

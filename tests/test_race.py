@@ -345,9 +345,9 @@ def test_report_makes_the_same_again_from_the_log(
 def test_a_run_that_cannot_be_learned_from_is_named_with_its_log(tmp_path: Path) -> None:
     write_race(tmp_path, [Drive("worstcase", circle(np.zeros(1), 1.0))])
     recorder: Any = SimpleNamespace(drain=lambda at_most_s: None)
-    race: Any = SimpleNamespace(out=tmp_path, settings=RaceSettings(), car=default_car())
+    prepared: Any = SimpleNamespace(training=None)
     unused: Any = None
-    drives = driving._Drives(race, unused, unused, recorder)
+    drives = driving.Drives(RaceSettings(), tmp_path, unused, prepared, unused, recorder)
     for run, reason in ((1, "no two states follow one another"), (2, "the log does not hold it")):
         plan = RunPlan(run, "worstcase", 2, 10.0, True, 0.0)
         with pytest.raises(InputError, match=rf"run\.mcap, run {run} \(worstcase\): {reason}"):

@@ -16,8 +16,7 @@ from bayesrace.controller.driver import Level
 from bayesrace.learning.sources import CYCLES
 from bayesrace.log import LogWriter
 from bayesrace.messages import Telemetry
-from bayesrace.operation.analysis.laps import LapTimes
-from bayesrace.operation.analysis.verdict import Cycles, judge, judge_log
+from bayesrace.operation.analysis.laps import Cycles, LapTimes, judge, judge_log
 from bayesrace.operation.closed_loop import ClosedLoop
 from tests.driven import telemetry
 from tests.racing import racing

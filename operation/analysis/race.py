@@ -6,6 +6,7 @@ beside it; nothing is taken over from the processes that were running.
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from functools import cached_property
 from pathlib import Path
 from typing import Final
@@ -19,8 +20,15 @@ from bayesrace.gp.weights import read_weights
 from bayesrace.learning.dataset import Dataset
 from bayesrace.learning.sources import dataset_from_columns
 from bayesrace.learning.validation import Validation, validate
-from bayesrace.operation.analysis.laps import positions_between, time_laps, trajectory_digest
-from bayesrace.operation.analysis.recording import Recording, RunRecord, read_recording
+from bayesrace.limit import read_limit
+from bayesrace.operation.analysis.laps import (
+    Cycles,
+    judge,
+    positions_between,
+    time_laps,
+    trajectory_digest,
+)
+from bayesrace.operation.analysis.recording import LIMIT_FILES, Recording, RunRecord, read_recording
 from bayesrace.operation.analysis.results import (
     LapResult,
     Percentiles,
@@ -28,8 +36,6 @@ from bayesrace.operation.analysis.results import (
     SettingsSummary,
     gp_metrics,
 )
-from bayesrace.operation.analysis.verdict import Cycles, judge
-from bayesrace.operation.limits import limits_in
 from bayesrace.raceline import RaceLine
 from bayesrace.tracks import PathProjection, Track
 from bayesrace.tracks.spline import CentrelineSearch, PlaneSpline
@@ -244,7 +250,7 @@ class RaceAnalysis:
         gaps = sum(run.record.gaps for run in self.runs)
         metrics = {who: gp_metrics(one.metrics) for who, one in self.validations.items()}
         recording = self.recording
-        limit_s = limits_in(recording.directory)
+        limit_s = _limits_in(recording.directory)
         return RaceResult(
             settings=_summary(recording),
             laps=[run.result(recording.settings.laps, limit_s) for run in self.runs],
@@ -274,6 +280,15 @@ def _summary(recording: Recording) -> SettingsSummary:
         constraints=settings.mpc.constraints,
         fmu=Path(settings.fmu or other).name,
     )
+
+
+def _limits_in(run_dir: Path) -> dict[str, float]:
+    """The limits [s] by kind of lap, without any not found."""
+    found = {}
+    for kind, name in LIMIT_FILES.items():
+        with suppress(InputError):
+            found[kind] = read_limit(run_dir / name).lap_s
+    return found
 
 
 def _real_time_factor(runs: Sequence[RunRecord]) -> float | None:

@@ -22,6 +22,7 @@ from bayesrace.transport import Numbering
 from bayesrace.vehicles import CarParameters, default_car, described_car
 
 __all__ = [
+    "LIMIT_FILES",
     "RUN_COLUMNS",
     "RUN_EVENT",
     "PlannedRun",
@@ -34,6 +35,9 @@ __all__ = [
 
 _log = logging.getLogger("bayesrace.report")
 
+
+LIMIT_FILES: Final = {"standing": "limit-standing.csv", "flying": "limit-flying.csv"}
+"""In a run directory: the fastest laps that the car can drive, by their kind."""
 
 RUN_EVENT: Final = "run"
 """Kind of the event that announces a run of a race before it starts."""
