@@ -4,6 +4,6 @@ All times are in the messages. A measurement records a run and computes the legs
 same code whether the run was started here, was driven elsewhere, or was recorded earlier.
 
 In the order of use: ``settings``; ``measure`` records the run, with the processes of ``beside``.
-``tables`` reads the log, and ``legs`` joins the messages of a cycle, relates the clocks of plant
-and controller, and counts messages. ``analysis`` makes the ``results``; ``report`` shows them.
+``legs`` reads the log, joins the messages of a cycle, relates the clocks of plant and controller,
+and counts messages. ``analysis`` makes the ``results``; ``report`` shows them.
 """

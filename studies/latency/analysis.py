@@ -11,7 +11,16 @@ import numpy as np
 
 from bayesrace.arrays import Floats
 from bayesrace.columns import Columns
-from bayesrace.studies.latency.legs import ANSWER, LEGS, ClockMap, Cycles
+from bayesrace.studies.latency.legs import (
+    ANSWER,
+    LEGS,
+    MOST_CYCLES,
+    ClockMap,
+    Cycles,
+    begins_anew,
+    read_tables,
+    split,
+)
 from bayesrace.studies.latency.results import (
     BareLoop,
     Clocks,
@@ -22,7 +31,6 @@ from bayesrace.studies.latency.results import (
     Traffic,
 )
 from bayesrace.studies.latency.settings import LatencySettings
-from bayesrace.studies.latency.tables import MOST_CYCLES, begins_anew, read_tables, split
 from bayesrace.tracks import Track
 
 __all__ = ["Analysis", "Beside", "analyse"]
@@ -30,6 +38,12 @@ __all__ = ["Analysis", "Beside", "analyse"]
 
 _IN_FLIGHT: Final = 2
 """Messages in flight at most: sent, but neither received nor lost, at an end of a part."""
+
+_COUNTS: Final = (
+    "skipped", "deadline_misses", "fallbacks", "repeated_answers", "late_states",
+    "overtaken_answers", "unobserved", "restarts",
+)  # fmt: skip
+"""That the result has as they are."""
 
 _BATCH: Final = 4096
 _INTERVALS: Final = 60
@@ -69,22 +83,13 @@ def analyse(log: Path, settings: LatencySettings, track: Track | None, beside: B
     # Runs in real time, or those in lockstep if there are no others.
     chosen = [part for part in parts if not part["states"]["lockstep"][0]] or parts
     cycles = [Cycles(part) for part in chosen]
-    begin_ns = int(cycles[0].states["wall_ns"][0])
-    span_s = float(np.ptp(np.concatenate([one.states["wall_ns"] for one in cycles]))) * 1e-9
-    series = _series([one.legs() for one in cycles], begin_ns)
-    clock = _clocks([one.clock for one in cycles if one.clock is not None])
-    legs = {leg: _leg(leg, one, clock) for leg, one in series.items()}
     counts = sum((one.counts() for one in cycles), Counter())
-    messages = _traffic(counts, len(cycles))
-    period_us = counts["length_ns"] * 1e-3 / counts["periods"] if counts["periods"] else None
-    rate_hz = float(tables["heartbeats"]["rate_hz"].max(initial=0.0))
-    rate_hz = rate_hz or (1e6 / period_us if period_us else 0.0)
-    restarts = np.count_nonzero(np.diff(tables["states"]["epoch"]))
-    restarts += np.count_nonzero(begins_anew(tables["actuations"]))
+    begun = np.diff(tables["states"]["epoch"]) != 0, begins_anew(tables["actuations"])
+    counts["restarts"] = int(sum(map(np.count_nonzero, begun)))
     remarks = {
         "messages are missing in the log; the run may have had them": counts["unobserved"],
         "messages of the log could not be decoded": refused,
-        "restarts of plant or controller": restarts,
+        "restarts of plant or controller": counts["restarts"],
         "runs in lockstep are left out": len(parts) - len(chosen),
         "runs are in lockstep, without deadlines and wake-ups": (
             len(chosen) if chosen[0]["states"]["lockstep"][0] else 0
@@ -93,41 +98,20 @@ def analyse(log: Path, settings: LatencySettings, track: Track | None, beside: B
             MOST_CYCLES if len(tables["states"]) >= MOST_CYCLES else 0
         ),
     }
-    bare = beside.bare[1] if beside.bare else None
-    by_name = ("skipped", "deadline_misses", "fallbacks", "repeated_answers", "late_states",
-               "overtaken_answers", "unobserved")  # fmt: skip
+    begin_ns = int(cycles[0].states["wall_ns"][0])
+    span_s = float(np.ptp(np.concatenate([one.states["wall_ns"] for one in cycles]))) * 1e-9
+    clocks = _clocks([one.clock for one in cycles if one.clock is not None])
+    series = _series([one.legs() for one in cycles], begin_ns)
+    legs = {leg: _leg(leg, one, clocks) for leg, one in series.items()}
     result = LatencyResult(
-        car=car,
-        track=settings.track,
-        rate_hz=rate_hz,
-        duration_s=span_s,
-        load=settings.load,
-        attached=settings.attach is not None,
-        recorded=settings.log is not None,
+        car=car, track=settings.track, duration_s=span_s, load=settings.load,
+        attached=settings.attach is not None, recorded=settings.log is not None,
         started=datetime.fromtimestamp(begin_ns // 1e9, UTC).astimezone().isoformat(),
-        host=beside.host,
-        state_to_actuation_us=legs.get(ANSWER),
-        legs_us=legs,
-        ticks=counts["releases"] + counts["skipped"],
-        **{name: counts[name] for name in by_name},
-        overruns=counts["overruns"] if len(tables["heartbeats"]) else None,
-        bare_loop_misses=bare.misses if bare else None,
-        bare_loop_us=bare,
-        round_trip_us=None if beside.round_trip is None else beside.round_trip.distribution(),
-        mean_period_us=period_us,
-        rate_error=period_us * rate_hz * 1e-6 - 1.0 if period_us else None,
-        **{
-            name: sum(getattr(one, name) for one in messages.values()) if messages else None
-            for name in ("sent", "received", "lost")
-        },
-        traffic=messages,
-        rss_growth_bytes=max((one.growth_bytes for one in beside.rss.values()), default=None),
-        rss=beside.rss,
-        restarts=restarts,
-        **_drive(tables["truth"], track),
-        clocks=clock,
+        state_to_actuation_us=legs.get(ANSWER), legs_us=legs, clocks=clocks,
         notes=[*beside.notes, *(f"{many} {text}" for text, many in remarks.items() if many)],
-    )
+        **_beside(beside), **_timing(counts, tables["heartbeats"]),
+        **_messages(counts, len(cycles)), **_drive(tables["truth"], track),
+    )  # fmt: skip
     edges_s = np.linspace(0.0, max(span_s, 1e-3), int(np.clip(span_s // 2.0, 1, _INTERVALS)) + 1)
     if beside.bare:
         series["bare_loop"] = beside.bare[0]
@@ -161,18 +145,48 @@ def _leg(leg: str, series: Series, clocks: Clocks | None) -> LegResult:
     )
 
 
-def _traffic(counts: Counter[str], parts: int) -> dict[str, Traffic]:
-    """Of states and of actuations, if they are counted."""
-    found = {}
+def _beside(beside: Beside) -> dict[str, Any]:
+    """What was measured beside the run."""
+    bare = beside.bare[1] if beside.bare else None
+    return {
+        "host": beside.host,
+        "bare_loop_misses": bare.misses if bare else None,
+        "bare_loop_us": bare,
+        "round_trip_us": beside.round_trip and beside.round_trip.distribution(),
+        "rss": beside.rss,
+        "rss_growth_bytes": max((one.growth_bytes for one in beside.rss.values()), default=None),
+    }
+
+
+def _timing(counts: Counter[str], heartbeats: Columns) -> dict[str, Any]:
+    """Counts of cycles, all runs together, and their mean period."""
+    period_us = counts["length_ns"] * 1e-3 / counts["periods"] if counts["periods"] else None
+    rate_hz = float(heartbeats["rate_hz"].max(initial=0.0))
+    rate_hz = rate_hz or (1e6 / period_us if period_us else 0.0)
+    return {
+        **{name: counts[name] for name in _COUNTS},
+        "ticks": counts["releases"] + counts["skipped"],
+        "overruns": counts["overruns"] if len(heartbeats) else None,
+        "rate_hz": rate_hz,
+        "mean_period_us": period_us,
+        "rate_error": period_us * rate_hz * 1e-6 - 1.0 if period_us else None,
+    }
+
+
+def _messages(counts: Counter[str], parts: int) -> dict[str, Any]:
+    """Of states and of actuations, if they are counted, and of both."""
+    traffic = {}
     for stream in ("states", "actuations"):
         if f"{stream}_sent" in counts:
-            sent, received, lost = (counts[f"{stream}_{k}"] for k in ("sent", "received", "lost"))
-            left = sent - received - lost
-            found[stream] = Traffic(
-                sent=sent, received=received, lost=lost, in_flight=left,
-                complete=abs(left) <= parts * _IN_FLIGHT,
-            )  # fmt: skip
-    return found
+            numbers = {name: counts[f"{stream}_{name}"] for name in ("sent", "received", "lost")}
+            left = numbers["sent"] - numbers["received"] - numbers["lost"]
+            complete = abs(left) <= parts * _IN_FLIGHT
+            traffic[stream] = Traffic(**numbers, in_flight=left, complete=complete)
+    both = {
+        name: sum(getattr(one, name) for one in traffic.values()) if traffic else None
+        for name in ("sent", "received", "lost")
+    }
+    return {"traffic": traffic, **both}
 
 
 def _drive(truth: Columns, track: Track | None) -> dict[str, Any]:
