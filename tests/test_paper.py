@@ -17,12 +17,10 @@ from bayesrace.learning.gaussian_process import PairDistances, maximise, starts
 from bayesrace.operation.settings import RaceSettings
 from bayesrace.operation.terminal.terminal import Stage, stages_on
 from bayesrace.studies.paper import make
-from bayesrace.studies.paper import residual as learning
-from bayesrace.studies.paper.experiment import Experiment
-from bayesrace.studies.paper.finding import Finding, at_most
+from bayesrace.studies.paper import models as learning
+from bayesrace.studies.paper.experiment import Experiment, Finding, at_most
 from bayesrace.studies.paper.loop import line_section, published_line, tenth_section
-from bayesrace.studies.paper.models import model_section
-from bayesrace.studies.paper.residual import gains, kernel_section, smoothness
+from bayesrace.studies.paper.models import gains, kernel_section, model_section, smoothness
 from bayesrace.studies.paper.settings import DRIVES, PaperSettings
 from bayesrace.vehicles import CarParameters, builtin_cars, files, get_car
 from bayesrace.vehicles.models import dynamic

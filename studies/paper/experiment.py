@@ -1,13 +1,15 @@
-"""A car with everything that its drives need, and its laps; results that are kept."""
+"""A car with everything that its drives need, and its laps; results that are kept; a published
+result beside ours, and what a stated criterion says of the two."""
 
 import json
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from bayesrace.cache import cache_folder, cpu_identity, digest, kept, software
 from bayesrace.columns import LogColumns
@@ -29,7 +31,7 @@ from bayesrace.operation.terminal.terminal import Stages
 from bayesrace.raceline import RaceLine
 from bayesrace.studies.campaign.case import software_identity
 
-__all__ = ["Experiment", "stored"]
+__all__ = ["ELSEWHERE", "Experiment", "Figures", "Finding", "Section", "at_most", "stored"]
 
 _COLUMNS: Final = {**RUN_COLUMNS, TELEMETRY: f"{RUN_COLUMNS[TELEMETRY]} plan_x plan_u"}
 
@@ -95,7 +97,7 @@ class Experiment:
 
 def stored(name: str, parts: Iterable[str], make: Callable[[], Any]) -> Any:
     """What ``make`` returned for these parts, this software and this machine, as JSON."""
-    sources = ("studies/paper/residual.py", "studies/bench.py", "studies/settings.py")
+    sources = ("studies/paper/models.py", "studies/bench.py", "studies/settings.py")
     own = software(sources, ())
     key = digest((*parts, *own, software_identity(), cpu_identity()))
 
@@ -109,3 +111,67 @@ def stored(name: str, parts: Iterable[str], make: Callable[[], Any]) -> Any:
         path.write_text(json.dumps(make()))
 
     return kept(cache_folder() / f"{name}-{key}.json", write, read)
+
+
+# Findings ----------------------------------------------------------------------------------------
+
+ELSEWHERE: Final = "another track than the paper's, see --tracks"
+"""Why a lap is not compared."""
+
+
+class Finding(NamedTuple):
+    """One published number or statement and its counterpart here.
+
+    ``criterion``: a clause; the two agree if it ``holds`` (None: there is nothing to compare, and
+    ``reason`` says why). ``reason``: why they differ, should they.
+    """
+
+    what: str
+    published: str
+    ours: str
+    criterion: str
+    holds: bool | None
+    reason: str = ""
+
+    @property
+    def verdict(self) -> str:
+        """In one word or two."""
+        return {True: "agrees", False: "differs", None: "not compared"}[self.holds]
+
+    @property
+    def sentence(self) -> str:
+        """The verdict with its criterion, and the reason of a difference."""
+        if self.holds is None:
+            return f"Not compared: {self.reason}."
+        if self.holds:
+            return f"Agrees: {self.criterion}."
+        because = f"; {self.reason}" if self.reason else ""
+        return f"Differs: it does not hold that {self.criterion}{because}."
+
+
+def at_most(
+    what: str, published: float, ours: float | None, unit: str = "", reason: str = "",
+    comparable: bool = True,
+) -> Finding:  # fmt: skip
+    """Of a number of which less is better; None for ours: there is none."""
+    form = ".3f" if unit == "s" else ".3g"
+    left = f"{published:{form}} {unit}".strip()
+    right = "none" if ours is None else f"{ours:{form}} {unit}".strip()
+    if not comparable:
+        return Finding(what, left, right, "", None, ELSEWHERE)
+    holds = ours is not None and bool(ours <= published)
+    return Finding(what, left, right, "ours is at most the published one", holds, reason)
+
+
+Figures = dict[str, Figure]
+"""By file name without suffix."""
+
+
+class Section(NamedTuple):
+    """Figures and findings of one part of the paper, its ``place``; ``text``: what is shown."""
+
+    title: str
+    place: str
+    text: str
+    figures: Figures
+    findings: Sequence[Finding]

@@ -17,18 +17,17 @@ from bayesrace.operation.settings import PreparationSettings
 from bayesrace.operation.terminal.terminal import Stages
 from bayesrace.raceline import write_raceline
 from bayesrace.studies.bench import BenchResult, run_bench
-from bayesrace.studies.paper.experiment import Experiment, stored
-from bayesrace.studies.paper.finding import Finding, Section
+from bayesrace.studies.paper.experiment import Experiment, Finding, Section, stored
 from bayesrace.studies.paper.loop import line_section, loop_sections, published_line, tenth_section
-from bayesrace.studies.paper.models import model_section
-from bayesrace.studies.paper.published import SOURCE
-from bayesrace.studies.paper.residual import (
+from bayesrace.studies.paper.models import (
     Learned,
     kernel_section,
     learned,
     learning_sections,
+    model_section,
     smoothness,
 )
+from bayesrace.studies.paper.published import SOURCE
 from bayesrace.studies.paper.settings import LINE, PaperSettings
 from bayesrace.studies.settings import BenchSettings
 
