@@ -19,7 +19,7 @@ from bayesrace.transport.credentials import Credentials
 if __name__ == "__main__":
     count, bundle, *where = sys.argv[1:]
     credentials = None if bundle == "-" else Credentials.read(Path(bundle))
-    endpoints = Endpoints(connect=tuple(where), credentials=credentials, insecure=bundle == "-")
+    endpoints = Endpoints(connect=tuple(where), credentials=credentials)
     with ExitStack() as sessions:
         heard = []
         for _ in range(int(count)):

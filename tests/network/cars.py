@@ -18,7 +18,6 @@ from bayesrace.raceline.line import RaceLine, write_raceline
 from bayesrace.tracks import Track, write_track
 from bayesrace.vehicles import get_car
 from tests.conftest import fit_weights, offset_line
-from tests.network.hosts import Host
 from tests.programs import COMMAND, PATIENCE_S, ROOT, environment
 
 __all__ = [
@@ -79,14 +78,13 @@ def _weights() -> GpWeights:
 
 
 class Program:
-    """A running ``bayesrace`` subcommand, on a host of its own or on this one."""
+    """A running ``bayesrace`` subcommand."""
 
-    def __init__(self, output: Path, *arguments: str | Path, host: Host | None = None) -> None:
-        command = [*COMMAND, *map(str, arguments)]
+    def __init__(self, output: Path, *arguments: str | Path) -> None:
         self._output = output
         with output.open("ab") as file:
             self.process = subprocess.Popen(
-                command if host is None else host.command(*command),
+                [*COMMAND, *map(str, arguments)],
                 stdin=subprocess.DEVNULL,
                 stdout=file,
                 stderr=subprocess.STDOUT,
@@ -125,12 +123,11 @@ def start_plant(
     listen: str,
     *options: str,
     connect: Sequence[str] = (),
-    host: Host | None = None,
     name: str = "orca",
 ) -> Program:
     """A plant that listens there; it does not outlive this process."""
-    where = ("--name", name, "--endpoint", listen, *_each("--connect", connect), "--insecure")
-    return Program(folder / f"{name}-plant.txt", "plant", *where, *_parent(), *options, host=host)
+    where = ("--name", name, "--endpoint", listen, *_each("--connect", connect))
+    return Program(folder / f"{name}-plant.txt", "plant", *where, *_parent(), *options)
 
 
 def start_controller(
@@ -139,20 +136,19 @@ def start_controller(
     connect: str,
     listen: str,
     *options: str,
-    host: Host | None = None,
     name: str = "orca",
 ) -> Program:
     """A controller that connects to its plant, or a router, there; it does not outlive this
     process."""
-    where = ("--name", name, "--endpoint", connect, "--listen", listen, "--insecure")
+    where = ("--name", name, "--endpoint", connect, "--listen", listen)
     output = folder / f"{name}-controller.txt"
     arguments = ("controller", *course.arguments, *where, *_parent(), *options)
-    return Program(output, *arguments, host=host)
+    return Program(output, *arguments)
 
 
 def start_router(folder: Path, listen: str) -> Program:
     """A router; it does not outlive this process."""
-    return Program(folder / "router.txt", "router", "--listen", listen, "--insecure", *_parent())
+    return Program(folder / "router.txt", "router", "--listen", listen, *_parent())
 
 
 def _each(option: str, values: Sequence[str]) -> list[str]:

@@ -1,19 +1,8 @@
-"""Starts runs, follows and records them, in the test's own process or on another host; what a log
-holds of a drive.
+"""Starts runs, follows and records them; what a log holds of a drive."""
 
-    python -m tests.network.observer NAME TRACK LOG ENDPOINT...
-
-obeys lines on stdin (``start``, ``state``, ``status SOURCE``, ``stop``) and answers each with a
-line of JSON; the end of stdin ends it, and the current run.
-"""
-
-import json
 import math
-import subprocess
-import sys
-import time
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -36,14 +25,17 @@ from bayesrace.messages import (
 )
 from bayesrace.operation.drive import RunPlan, run_request
 from bayesrace.recorder import Recorder
-from bayesrace.tracks import Track, load_track
+from bayesrace.tracks import Track
 from bayesrace.transport import Director, Endpoints, open_session
-from tests.network.hosts import Host
-from tests.programs import PATIENCE_S, ROOT, environment, until
+from tests.programs import PATIENCE_S, until
 
 __all__ = [
-    "STANDING_MPS", "Journey", "Observer", "Remote", "drive_on", "observing", "observing_from",
-]  # fmt: skip
+    "STANDING_MPS",
+    "Journey",
+    "Observer",
+    "drive_on",
+    "observing",
+]
 
 STANDING_MPS = 0.05
 """Speed below which a car counts as standing."""
@@ -51,7 +43,7 @@ STANDING_MPS = 0.05
 _ENDLESS_S = 1e5
 
 
-def drive_on(follower: "Observer | Remote", away_m: float = 0.8) -> None:
+def drive_on(follower: "Observer", away_m: float = 0.8) -> None:
     """Waits until the car is that far from where it is now: it drives, and by itself."""
     until(lambda: bool(follower.state()), "a first state")
     begin = follower.state()["x"]
@@ -108,69 +100,8 @@ class Observer:
 @contextmanager
 def observing(endpoints: Sequence[str], name: str, track: Track, log: Path) -> Iterator[Observer]:
     """Follows and records from this process."""
-    connect = Endpoints(connect=tuple(endpoints), insecure=True)
-    with open_session(connect) as session, Recorder(session, name, log):
+    with open_session(Endpoints(connect=tuple(endpoints))) as session, Recorder(session, name, log):
         yield Observer(session, name, track)
-
-
-class Remote:
-    """An observer on another host; the same methods."""
-
-    def __init__(self, process: "subprocess.Popen[str]") -> None:
-        self._process = process
-
-    def _ask(self, line: str) -> Any:
-        assert self._process.stdin is not None
-        assert self._process.stdout is not None
-        self._process.stdin.write(f"{line}\n")
-        answer = self._process.stdout.readline()
-        assert answer, f"the observer ended with code {self._process.wait()}"
-        return json.loads(answer)
-
-    def start(self, run: int) -> int:
-        """Starts a run without end."""
-        answer = self._ask(f"start {run}")
-        assert answer == run, answer
-        return run
-
-    def state(self) -> dict[str, Any]:
-        """Fields of the newest state."""
-        fields: dict[str, Any] = self._ask("state")
-        return fields
-
-    def status(self, source: str) -> dict[str, Any]:
-        """Fields of the status."""
-        fields: dict[str, Any] = self._ask(f"status {source}")
-        return fields
-
-    def stop(self) -> None:
-        """Ends the run."""
-        self._ask("stop")
-
-
-@contextmanager
-def observing_from(
-    host: Host, endpoints: Sequence[str], name: str, track: Path, log: Path
-) -> Iterator[Remote]:
-    """Follows and records on that host; the log is whole after the block."""
-    with log.with_suffix(".txt").open("ab") as errors:
-        process = subprocess.Popen(
-            host.command(sys.executable, "-m", __name__, name, track, log, *endpoints),
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=errors,
-            text=True,
-            bufsize=1,
-            cwd=ROOT,
-            env=environment(),
-        )
-    with ExitStack() as cleanup:
-        cleanup.callback(process.wait)
-        cleanup.callback(process.kill)
-        yield Remote(process)
-        assert process.stdin is not None
-        process.stdin.close()
-        assert process.wait(PATIENCE_S) == 0, log.with_suffix(".txt").read_text()
 
 
 class Journey:
@@ -206,35 +137,3 @@ class Journey:
             for one in self.heartbeats
             if one.source == "controller" and begin_ns <= one.source_time_ns < end_ns
         }
-
-
-def _obey(observer: Observer, line: str) -> Any:
-    match line.split():
-        case ["start", run]:
-            return observer.start(int(run))
-        case ["state"]:
-            return observer.state()
-        case ["status", source]:
-            return observer.status(source)
-        case ["stop"]:
-            return observer.stop()
-    raise InputError(f"'{line}' is no command")
-
-
-def main(name: str, track: str, log: str, *endpoints: str) -> None:
-    """The program."""
-    with observing(endpoints, name, load_track(track), Path(log)) as observer:
-        for line in sys.stdin:
-            try:
-                answer = _obey(observer, line)
-            except InputError as error:
-                answer = {"error": str(error)}
-            sys.stdout.write(f"{json.dumps(answer, default=dict)}\n")
-            sys.stdout.flush()
-        with suppress(InputError):
-            observer.stop()
-        time.sleep(0.2)  # the plant's last word
-
-
-if __name__ == "__main__":
-    main(*sys.argv[1:])

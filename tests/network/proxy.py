@@ -1,41 +1,98 @@
-"""A TCP connection that can be broken: a relay between a port of its own and another one."""
+"""A bad link: a relay between an endpoint of its own and another one, by TCP or UDP.
+
+It delays and loses what passes, holds it up as a partition does, or breaks its connections. What is
+lost by TCP arrives late, and holds up what comes after it; by UDP it does not arrive.
+"""
 
 import math
+import queue
+import random
 import socket
 import threading
 import time
+from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import dataclass, field
+from typing import Final
 
 from bayesrace.transport import free_endpoint
 
 __all__ = ["Proxy"]
 
+_AGAIN: Final = 4
+"""After so many times the delay, two round trips, TCP sends again what was lost."""
+_DATAGRAM: Final = 1 << 16
+
 
 def _address(endpoint: str) -> tuple[str, int]:
-    host, port = endpoint.removeprefix("tcp/").rsplit(":", 1)
+    host, port = endpoint.partition("/")[2].rsplit(":", 1)
     return host, int(port)
 
 
+def _opened() -> threading.Event:
+    event = threading.Event()
+    event.set()
+    return event
+
+
+@dataclass
+class _Way:
+    """One direction over the link."""
+
+    random: random.Random
+    open: threading.Event = field(default_factory=_opened)
+    lost: int = 0
+
+
 class Proxy:
-    """Relays to the endpoint ``target`` whatever connects to :attr:`endpoint`."""
+    """Relays to the endpoint ``target`` whatever connects to :attr:`endpoint`.
+
+    Directions: ``forth`` is from the target, ``back`` to it.
+    """
 
     def __init__(self, target: str, bytes_per_s: float = math.inf) -> None:
-        """``bytes_per_s``: how fast it takes what is sent, in each direction."""
+        """``bytes_per_s``: how fast it takes what is sent by TCP, in each direction."""
         self._bytes_per_s = bytes_per_s
-        self.endpoint = free_endpoint()
+        self._protocol = target.partition("/")[0]
+        self.endpoint = free_endpoint().replace("tcp", self._protocol)
         self._target = target
         self._lock = threading.Lock()
         self._sockets: list[socket.socket] = []
         self._listener: socket.socket | None = None
+        self._ways = {name: _Way(random.Random(name)) for name in ("forth", "back")}
+        self.set()
         self.join()
+
+    def set(self, delay_s: float = 0.0, jitter_s: float = 0.0, loss: float = 0.0) -> None:
+        """Time on the way, uniform in ``delay_s`` ± ``jitter_s``, and probability of a loss."""
+        self._delay_s, self._jitter_s, self._loss = delay_s, jitter_s, loss
+
+    def hold(self, direction: str = "") -> None:
+        """Nothing gets through any more; both directions without one."""
+        for name in [direction] if direction else self._ways:
+            self._ways[name].open.clear()
+
+    def release(self) -> None:
+        """The end of that."""
+        for way in self._ways.values():
+            way.open.set()
+
+    @property
+    def lost(self) -> dict[str, int]:
+        """Losses by direction."""
+        return {name: way.lost for name, way in self._ways.items()}
 
     def join(self) -> None:
         """Listen (again)."""
+        if self._protocol == "udp":
+            self._relay_datagrams()
+            return
         self._listener = socket.create_server(_address(self.endpoint))
         threading.Thread(target=self._accept, args=(self._listener,), daemon=True).start()
 
     def cut(self) -> None:
         """Break all connections; new ones are refused."""
+        self.release()
         if self._listener is not None:
             # Closing alone would not wake the thread that accepts.
             with suppress(OSError):
@@ -65,17 +122,85 @@ class Proxy:
                     continue
                 with self._lock:
                     self._sockets += [near, far]
-                for source, sink in ((near, far), (far, near)):
-                    source.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-                    threading.Thread(target=self._relay, args=(source, sink), daemon=True).start()
+                self._relay_bytes("back", near, far)
+                self._relay_bytes("forth", far, near)
 
-    def _relay(self, source: socket.socket, sink: socket.socket) -> None:
+    def _relay_bytes(self, direction: str, source: socket.socket, sink: socket.socket) -> None:
+        source.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         slow = math.isfinite(self._bytes_per_s)
-        with suppress(OSError):
-            while data := source.recv(1 << (10 if slow else 16)):
-                sink.sendall(data)
-                time.sleep(len(data) / self._bytes_per_s)
-        for one in (source, sink):
+
+        def receive() -> bytes:
+            data = source.recv(1 << (10 if slow else 16))
+            time.sleep(len(data) / self._bytes_per_s)
+            return data
+
+        def end() -> None:
+            for one in (source, sink):
+                with suppress(OSError):
+                    one.shutdown(socket.SHUT_RDWR)
+            source.close()
+
+        self._start(direction, receive, sink.sendall, end)
+
+    def _relay_datagrams(self) -> None:
+        """For one client, the last that has sent something."""
+        near, far = (socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2))
+        near.bind(_address(self.endpoint))
+        far.bind(("127.0.0.1", 0))
+        self._sockets += [near, far]
+        client: list[tuple[str, int]] = []
+
+        def from_client() -> bytes:
+            data, sender = near.recvfrom(_DATAGRAM)
+            client[:] = [sender]
+            return data
+
+        def to_target(data: bytes) -> None:
+            far.sendto(data, _address(self._target))
+
+        def to_client(data: bytes) -> None:
+            near.sendto(data, *client)
+
+        self._start("back", from_client, to_target, near.close)
+        self._start("forth", lambda: far.recv(_DATAGRAM), to_client, far.close)
+
+    def _start(
+        self,
+        direction: str,
+        receive: Callable[[], bytes],
+        send: Callable[[bytes], object],
+        end: Callable[[], None],
+    ) -> None:
+        """Relays until there is nothing to receive any more."""
+        way, waiting = self._ways[direction], queue.Queue[tuple[float, bytes]](10_000)
+        datagrams = self._protocol == "udp"
+
+        def take() -> None:
+            due_s = 0.0
             with suppress(OSError):
-                one.shutdown(socket.SHUT_RDWR)
-        source.close()
+                while data := receive():
+                    lost = way.random.random() < self._loss
+                    way.lost += lost
+                    if datagrams and (lost or not way.open.is_set()):
+                        continue
+                    delay_s = self._delay_s + way.random.uniform(-self._jitter_s, self._jitter_s)
+                    due_s = max(
+                        due_s,
+                        time.monotonic() + delay_s + (_AGAIN * self._delay_s if lost else 0.0),
+                    )
+                    waiting.put((due_s, data))
+            waiting.put((0.0, b""))
+
+        def deliver() -> None:
+            with suppress(OSError):
+                while True:
+                    due_s, data = waiting.get()
+                    if not data:
+                        break
+                    time.sleep(max(due_s - time.monotonic(), 0.0))
+                    way.open.wait()
+                    send(data)
+            end()
+
+        for work in (take, deliver):
+            threading.Thread(target=work, daemon=True).start()

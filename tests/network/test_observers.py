@@ -5,6 +5,7 @@ Zenoh's sockets linger for 10 s when they are closed, in a thread that serves al
 is over.
 """
 
+import math
 import signal
 import subprocess
 import sys
@@ -19,8 +20,7 @@ import pytest
 from bayesrace.configuration import read_configuration
 from bayesrace.transport import free_endpoint
 from tests.network.cars import Course, gentle_course, start_controller, start_plant
-from tests.network.hosts import PLANT_IP, Host, Network
-from tests.network.observer import observing, observing_from
+from tests.network.observer import observing
 from tests.network.proxy import Proxy
 from tests.programs import ROOT, environment, until
 from tests.security.authority import Bundles, bundles
@@ -42,14 +42,13 @@ def course(tmp_path_factory: pytest.TempPathFactory) -> Course:
 
 @contextmanager
 def bystanders(
-    count: int, where: Sequence[str], bundle: Path | str = "-", host: Host | None = None
+    count: int, where: Sequence[str], bundle: Path | str = "-"
 ) -> Iterator[subprocess.Popen[str]]:
     """That many observers in a process of their own, which hear the car."""
     words = [sys.executable, "-m", "tests.network.bystander", str(count), str(bundle), *where]
     process = subprocess.Popen(
-        words if host is None else host.command(*words),
-        stdout=subprocess.PIPE, text=True, cwd=ROOT, env=environment(),
-    )  # fmt: skip
+        words, stdout=subprocess.PIPE, text=True, cwd=ROOT, env=environment()
+    )
     try:
         assert process.stdout is not None
         assert process.stdout.readline() == "linked\n"
@@ -86,11 +85,19 @@ def test_observers_that_are_stopped(tmp_path: Path, course: Course, count: int) 
 
 
 @pytest.mark.check
-def test_observers_that_read_slowly(tmp_path: Path, course: Course) -> None:
+@pytest.mark.parametrize("vanish", [False, True])
+def test_observers_that_read_slowly_or_vanish(tmp_path: Path, course: Course, vanish: bool) -> None:
     with driving(tmp_path, course) as (where, braked):
-        plant, controller = (Proxy(one, bytes_per_s=1e4) for one in where)
+        rate = math.inf if vanish else 1e4
+        plant, controller = (Proxy(one, bytes_per_s=rate) for one in where)
+
+        def trouble() -> None:
+            if vanish:
+                plant.hold()
+                controller.hold()
+
         with plant, controller, bystanders(5, (plant.endpoint, controller.endpoint)):
-            check_driven(braked, lambda: None)
+            check_driven(braked, trouble)
 
 
 @pytest.mark.check
@@ -107,33 +114,14 @@ def test_observers_that_are_stopped_at_secured_links(
             )
 
 
-@pytest.mark.check
-def test_observers_that_vanish(tmp_path: Path, course: Course, net: Network) -> None:
-    with (
-        driving(tmp_path, course, net.plant) as (where, braked),
-        bystanders(5, where, host=net.controller),
-    ):
-        check_driven(braked, net.link.cut)
-
-
 @contextmanager
-def driving(
-    folder: Path, course: Course, host: Host | None = None
-) -> Iterator[tuple[tuple[str, str], Callable[[], int]]]:
+def driving(folder: Path, course: Course) -> Iterator[tuple[tuple[str, str], Callable[[], int]]]:
     """A car that drives; where plant and controller listen, and the count of periods undriven."""
     where = (free_endpoint(), free_endpoint())
-    if host is not None:
-        where = (f"tcp/{PLANT_IP}:7447", f"tcp/{PLANT_IP}:7448")
-    log = folder / "run.mcap"
-    follow = (
-        observing(where, "orca", course.track, log)
-        if host is None
-        else observing_from(host, where, "orca", course.track_file, log)
-    )
     with (
-        start_plant(folder, where[0], host=host),
-        start_controller(folder, course, *where, host=host),
-        follow as observer,
+        start_plant(folder, where[0]),
+        start_controller(folder, course, *where),
+        observing(where, "orca", course.track, folder / "run.mcap") as observer,
     ):
         observer.start(1)
         until(lambda: bool(observer.state()), "a first state")
