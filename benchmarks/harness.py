@@ -21,8 +21,7 @@ from rich.console import Console
 from rich.table import Table
 
 from bayesrace.cache import cpu_identity
-from bayesrace.controller.assembly import compiled_controller
-from bayesrace.controller.mpc import PredictiveController
+from bayesrace.controller.assembly import PredictiveController, compiled_controller
 from bayesrace.gp.weights import read_weights
 from bayesrace.operation.preparation import Prepared, prepare
 from bayesrace.operation.settings import PreparationSettings

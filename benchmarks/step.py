@@ -18,8 +18,8 @@ import numpy as np
 from bayesrace.arrays import Floats
 from bayesrace.codegen.build import build
 from bayesrace.codegen.settings import BuildSettings
+from bayesrace.controller.assembly import PathTable, make_path_table
 from bayesrace.controller.native_step import NativeStep
-from bayesrace.controller.path_table import PathTable, make_path_table
 from bayesrace.controller.settings import MpcSettings
 from bayesrace.gp.weights import read_weights
 from bayesrace.plant.simulator import PLANT, Simulator

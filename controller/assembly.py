@@ -1,17 +1,20 @@
-"""Puts a predictive controller together from the files that describe it."""
+"""The predictive controller: put together from the files that describe it, and as the cycle
+drives it."""
 
+import math
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, Final, TypeVar
 
+import numpy as np
 from pydantic import BaseModel, ValidationError
 
-from bayesrace.controller.mpc import PredictiveController
-from bayesrace.controller.native_step import NativeStep
-from bayesrace.controller.path_table import PathTable, make_path_table
-from bayesrace.controller.settings import MpcSettings
+from bayesrace.arrays import Floats
+from bayesrace.controller.interface import StepOutput
+from bayesrace.controller.native_step import Artefact, NativeStep, StepStatus
+from bayesrace.controller.settings import GateSettings, MpcSettings
 from bayesrace.controller.weights.adoption import WeightsPort
 from bayesrace.controller.weights.checks import Checks
-from bayesrace.controller.weights.settings import GateSettings
 from bayesrace.controller.weights.store import AcceptedWeights, History, Store, digest_of
 from bayesrace.errors import InputError, faults_in
 from bayesrace.files import read_whole
@@ -19,15 +22,136 @@ from bayesrace.gp.weights import (
     GpWeights,
     decode_weights,
     encode_weights,
+    pack_weights,
     read_weights,
 )
+from bayesrace.messages import NOT_REPORTED
 from bayesrace.raceline import RaceLine, read_raceline_for
 from bayesrace.tracks import Track, load_track
+from bayesrace.tracks.spline import PlaneSpline
 from bayesrace.vehicles import CarParameters
 
-__all__ = ["compiled_controller", "predictive_controller", "read_checked", "read_settings"]
+__all__ = [
+    "CAPACITY", "PathTable", "PredictiveController", "compiled_controller", "make_path_table",
+    "predictive_controller", "read_checked", "read_settings",
+]  # fmt: skip
 
 Settings = TypeVar("Settings", bound=BaseModel)
+
+
+CAPACITY: Final = 8192
+"""BR_PATH_CAPACITY in controller/native/bayesrace_mpc.h."""
+
+ASTRAY_MAX: Final = 0.05
+"""Share of a line that may be farther out than half the track's width: with more it belongs to
+another track."""
+
+_IN_C: Final = {
+    "residual_dynamics": "defect",
+    "residual_bounds": "bound",
+    "residual_stationarity": "stationarity",
+    "n_ref_m": "lateral_m",
+}
+"""Names in br_mpc_info, where they are not those of :class:`bayesrace.messages.Telemetry`."""
+
+
+@dataclass(frozen=True, eq=False)
+class PathTable:
+    """Rows x, y, speed, left unit normal of the centreline (2), lower and upper bound of n . p.
+
+    ``rows`` has shape (n, 7), sampled every ``spacing_m`` along the closed racing line.
+    """
+
+    rows: Floats
+    spacing_m: float
+
+
+def make_path_table(track: Track, line: RaceLine, spacing_m: float) -> PathTable:
+    """Samples the line and, at each sample's projection on the centreline, the two half-planes.
+
+    The half-planes are parallel to the centreline (paper, equation 8d), their normal has length 1,
+    their distance is the track's width there. ``spacing_m``: wanted distance of rows; between them
+    the planner interpolates linearly. InputError if the line belongs to another track.
+    """
+    count = min(CAPACITY, max(8, math.ceil(line.length_m / spacing_m)))
+    s: Floats = np.arange(count, dtype=np.float64) * (line.length_m / count)
+    nodes = np.append(line.s_m, line.s_m[0] + line.length_m)
+    xy = PlaneSpline(line.s_m, line.xy_m, line.length_m)(s)
+    speed = np.interp(s, nodes, np.append(line.vx_mps, line.vx_mps[0]), period=line.length_m)
+    on_track = track.project_path(xy)
+    right, left = track.widths(on_track.s_m)
+    astray = float(np.mean(on_track.off_track_m > (right + left) / 2))
+    if astray > ASTRAY_MAX:
+        raise InputError(
+            f"{100 * astray:.0f} % of the racing line '{line.track_name}' is far outside the track "
+            f"'{track.name}': it was computed for another track; run 'bayesrace raceline'"
+        )
+    normal = track.normal(on_track.s_m)
+    along = np.sum(normal * track.position(on_track.s_m), axis=1)
+    rows = np.column_stack([xy, speed, normal, along - right, along + left])
+    return PathTable(np.ascontiguousarray(rows), line.length_m / count)
+
+
+class PredictiveController:
+    """See :class:`.Controller`; BestCase, WorstCase and BayesRace alike."""
+
+    def __init__(
+        self,
+        step: NativeStep,
+        port: WeightsPort | None = None,
+        track: str = "",
+    ) -> None:
+        """``step``: with parameters and path set. ``port``: how a process takes over new weights;
+        without, it takes none. ``track``: identity of the track that the path is for."""
+        self.native = step
+        self.port = port
+        self.track = track
+        known = {name for name, _ in step.artefact.ffi.typeof("br_mpc_info").fields}
+        names = ((name, _IN_C.get(name, name)) for name in NOT_REPORTED)
+        self._numbers = [(name, in_c) for name, in_c in names if in_c in known]
+        self._output = StepOutput(
+            u=step.plan_u[0],
+            plan_x=step.plan_x,
+            plan_u=step.plan_u,
+            tube_m=step.tube,
+            plan_step_s=step.manifest.step_s,
+        )
+
+    last_error = ""
+    """The cycle knows it."""
+
+    @property
+    def artefact(self) -> Artefact:
+        """What it was built as."""
+        return self.native.artefact
+
+    @property
+    def weights_version(self) -> str:
+        """Version of the weights in use; empty while there is no correction."""
+        return self.native.weights_version
+
+    def begin_cycle(self, memory: Any, size: int, hold: bool, cycle: Any) -> int:
+        """With the compiled step, called from C."""
+        native = self.native
+        drive = native.artefact.library.br_cycle_drive_mpc
+        return int(drive(memory, size, native.handle, hold, cycle))
+
+    def raise_pending(self) -> None:
+        """Nothing: its step is C."""
+
+    def result(self, cycle: Any) -> StepOutput:
+        """Of the cycle's last step; the plan, too, if it is not usable."""
+        info = self.artefact.library.br_cycle_info(cycle)
+        output = self._output
+        self.native.read_plan()
+        self.native.read_tube()
+        # Acceptable and converged may both be driven; the residuals below distinguish them.
+        output.status = 0 if info.status <= StepStatus.ACCEPTABLE else info.status
+        output.cost = info.cost
+        output.cost_shifted = info.shifted_cost if info.shifts >= 0 else -1.0
+        output.second_start = info.second_start
+        output.numbers = {name: getattr(info, in_c) for name, in_c in self._numbers}
+        return output
 
 
 def read_settings(path: Path | None, form: type[Settings]) -> Settings:
@@ -62,8 +186,7 @@ def compiled_controller(
     step.set_path(table or make_path_table(track, line, car.tuning.path.spacing_m))
     if weights is not None:
         step.set_weights(weights)
-    version = "" if weights is None else weights.version
-    return PredictiveController(step, version, track=track.identity)
+    return PredictiveController(step, track=track.identity)
 
 
 def read_checked(
@@ -100,20 +223,18 @@ def predictive_controller(
     line = read_raceline_for(raceline, driven_on, car)
     mpc = read_settings(settings, MpcSettings)
     step = compiled_controller(artefact, car, driven_on, line, loaded, mpc).native
-    version, data = ("", b"") if loaded is None else (loaded.version, encode_weights(loaded))
+    data, packed = (b"", b"") if loaded is None else (encode_weights(loaded), pack_weights(loaded))
     first = AcceptedWeights(
-        number=0,
-        version=version,
-        digest=digest_of(data),
-        proven=True,
-        data=data,
-    )
+        number=0, version=step.weights_version, digest=digest_of(data), proven=True, data=data,
+        packed=packed,
+    )  # fmt: skip
     folder = None if store is None else Store(store, step.manifest.discretisation)
     history = History(entries=[first]) if folder is None else folder.restore(first)
-    if (proven := history.reference) is not first:
+    in_use, proven = history.in_use, history.reference
+    if proven is not first:
         step.set_weights(decode_weights(proven.data))
-    if history.in_use is not proven:  # a controller has ended while it watched them
-        step.stage_weights(history.in_use.packed)
-        step.adopt_weights()
+    if in_use is not proven:  # a controller has ended while it watched them
+        step.stage_weights(in_use.packed)
+        step.adopt_weights(in_use.version)
     port = WeightsPort(artefact.resolve(), step, car, history, folder)
-    return PredictiveController(step, history.in_use.version, port, driven_on.identity)
+    return PredictiveController(step, port, driven_on.identity)

@@ -20,7 +20,7 @@ from bayesrace.controller.process_settings import ControllerSettings
 from bayesrace.messages import NOT_REPORTED, SENSOR_FAULTS, Actuation, State, Telemetry
 from bayesrace.vehicles.parameters import CarParameters
 
-__all__ = ["Cycle", "Timing", "telemetry_of"]
+__all__ = ["Cycle", "Timing"]
 
 _SCALE: Final = 1e6
 _LARGEST: Final = 1e6
@@ -65,15 +65,7 @@ class Cycle:
         self, controller: Controller, car: CarParameters, settings: ControllerSettings
     ) -> None:
         """``car``: whose limits hold."""
-        self.driver = Driver(
-            controller,
-            car,
-            settings.fallback,
-            settings.compensation,
-            settings.stale_s,
-            settings.hold,
-            settings.sensor_tolerance,
-        )
+        self.driver = Driver(controller, car, settings)
         self.timing = Timing()
         self._controller = controller
 
@@ -123,41 +115,35 @@ class Cycle:
 
     def telemetry(self, seq: int, state: State, decision: Decision, received_ns: int) -> Telemetry:
         """How the cycle went; counts it."""
-        self.timing.ticks += 1
-        self.timing.received_ns = received_ns
-        return telemetry_of(seq, state, decision, self.driver.output, self.timing)
-
-
-def telemetry_of(
-    seq: int, state: State, decision: Decision, output: StepOutput | None, timing: Timing
-) -> Telemetry:
-    """The message of one cycle; ``output``: of its step, if one was made."""
-    output = output or _NO_OUTPUT
-    numbers = {"cost": output.cost, "cost_shifted": output.cost_shifted, **output.numbers}
-    return Telemetry(
-        seq=seq,
-        source_time_ns=time.monotonic_ns(),
-        run=state.run,
-        state_seq=state.seq,
-        status=decision.status,
-        fallback=int(decision.level),
-        tick=timing.tick,
-        released_ns=timing.released_ns,
-        received_ns=timing.received_ns,
-        missed=timing.missed,
-        wake_us=timing.wake_us,
-        decode_us=timing.decode_us,
-        prepare_us=timing.prepare_us,
-        solve_us=decision.step_us or timing.solve_us,
-        encode_us=timing.encode_us,
-        delay_s=decision.delay_s,
-        plan_x=_finite(output.plan_x),
-        plan_u=_finite(output.plan_u),
-        tube_m=_finite(output.tube_m),
-        sensor_fault=SENSOR_FAULTS[decision.fault],
-        second_start=output.second_start,
-        **{name: _known(numbers.get(name, none), none) for name, none in NOT_REPORTED.items()},
-    )
+        timing = self.timing
+        timing.ticks += 1
+        timing.received_ns = received_ns
+        output = self.driver.output or _NO_OUTPUT
+        numbers = {"cost": output.cost, "cost_shifted": output.cost_shifted, **output.numbers}
+        return Telemetry(
+            seq=seq,
+            source_time_ns=time.monotonic_ns(),
+            run=state.run,
+            state_seq=state.seq,
+            status=decision.status,
+            fallback=int(decision.level),
+            tick=timing.tick,
+            released_ns=timing.released_ns,
+            received_ns=timing.received_ns,
+            missed=timing.missed,
+            wake_us=timing.wake_us,
+            decode_us=timing.decode_us,
+            prepare_us=timing.prepare_us,
+            solve_us=decision.step_us or timing.solve_us,
+            encode_us=timing.encode_us,
+            delay_s=decision.delay_s,
+            plan_x=_finite(output.plan_x),
+            plan_u=_finite(output.plan_u),
+            tube_m=_finite(output.tube_m),
+            sensor_fault=SENSOR_FAULTS[decision.fault],
+            second_start=output.second_start,
+            **{name: _known(numbers.get(name, none), none) for name, none in NOT_REPORTED.items()},
+        )
 
 
 def _finite(plan: Floats) -> tuple[float, ...]:

@@ -10,12 +10,7 @@ from dataclasses import dataclass
 from enum import IntEnum, StrEnum
 
 from bayesrace.controller.interface import Controller, Environment, StepOutput
-from bayesrace.controller.settings import (
-    CompensationSettings,
-    FallbackSettings,
-    cycle_values,
-    input_limits,
-)
+from bayesrace.controller.process_settings import ControllerSettings
 from bayesrace.messages import SENSOR_FAULTS, BrakingPlan, State
 from bayesrace.transport import Numbering
 from bayesrace.vehicles.parameters import CarParameters
@@ -83,39 +78,29 @@ class Driver:
     """Drives one car with one controller; for one thread."""
 
     def __init__(
-        self,
-        controller: Controller,
-        car: CarParameters,
-        fallback: FallbackSettings,
-        compensation: CompensationSettings,
-        stale_s: float,
-        hold: bool = False,
-        sensor_tolerance: float = 1.0,
+        self, controller: Controller, car: CarParameters, settings: ControllerSettings
     ) -> None:
-        """``stale_s``: age from which a state is no longer predicted forward but fallen back
-        from. ``hold``: wait for :meth:`go`. ``sensor_tolerance``: see :class:`.ControllerSettings`.
-        InputError if the controller's artefact drives no car.
-        """
+        """``car``: whose limits hold. InputError if the controller's artefact drives no car."""
         self.controller = controller
         artefact = controller.artefact
         artefact.check_cycle()
         library = self._library = artefact.library
         ffi, size = artefact.ffi, library.br_cycle_memory_size()
         self._memory, made = artefact.memory(size), ffi.new("br_cycle **")
-        artefact.check(controller.begin_cycle(self._memory, size, hold, made), "control cycle")
+        error = controller.begin_cycle(self._memory, size, settings.hold, made)
+        artefact.check(error, "control cycle")
         self._cycle = made[0]
-        values = cycle_values(
-            car, fallback, compensation, stale_s, sensor_tolerance
-        ) | input_limits(car)
-        settings = ffi.new("br_driving *", values)
-        artefact.check(library.br_cycle_set_driving(self._cycle, settings), "cycle settings")
+        rate = car.delta_rate_max_radps
+        limits = {"u_low": (car.d_min, -rate), "u_high": (car.d_max, rate)}
+        driving = ffi.new("br_driving *", settings.cycle_values(car) | limits)
+        artefact.check(library.br_cycle_set_driving(self._cycle, driving), "cycle settings")
         clock = ffi.addressof(library, "br_mpc_monotonic")
         library.br_cycle_set_clock(self._cycle, clock, ffi.NULL)
         self._counters = library.br_cycle_counters(self._cycle)
         self._measured = ffi.new("br_measured *")
         self._measured.averaged = 1
         self._decided, self._braking = ffi.new("br_decision *"), ffi.new("br_braking *")
-        self._new, self._null = ffi.new, ffi.NULL
+        self._around, self._null = ffi.new("br_environment *"), ffi.NULL
         self._refused: State | None = None
         self.last_error = ""
         """Of the last step that was broken; empty if none was."""
@@ -237,7 +222,8 @@ class Driver:
         """
         decision, decided, around = self.decision, self._decided, self._null
         if environment is not None:
-            around = self._new("br_environment *", environment)
+            around = self._around
+            around.speed_limit_mps, around.speed_limit_rate_mps2 = environment
         error = self._library.br_cycle_decide(
             self._cycle, around, decided_at_s, budget_s, spent_s, decided
         )

@@ -89,19 +89,7 @@ class Controller(Protocol):
 
     @property
     def port(self) -> "WeightsPort | None":
-        """Where a process stages weights that are checked; None: :meth:`set_weights` is asked."""
-
-    def adopt_weights(self, version: str) -> None:
-        """Use what has been staged at :attr:`port` from the next step on: within microseconds."""
-
-    def revert_weights(self, version: str) -> None:
-        """Use the proven weights, of that version, again: as fast as an adoption."""
-
-    def set_weights(self, data: bytes) -> str:
-        """Take over weights (``bayesrace.gp.weights`` file content) from the next step on.
-
-        Returns their version; InputError says why they are refused, and the old ones stay.
-        """
+        """Where a process stages weights that are checked; None: it takes no weights."""
 
 
 class ControlLaw(Protocol):

@@ -9,22 +9,26 @@ from collections.abc import Mapping
 from enum import IntEnum
 from mmap import ACCESS_COPY, mmap
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import numpy.typing as npt
 
 from bayesrace.arrays import Floats
 from bayesrace.controller.interface import Environment
-from bayesrace.controller.path_table import PATH_COLUMNS, PathTable
 from bayesrace.controller.settings import MpcSettings
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import OUTPUT_HEAD, GpWeights, pack_weights
 from bayesrace.manifest import DECLARATIONS, check_library, read_manifest
 from bayesrace.vehicles import CarParameters
 
-__all__ = ["Artefact", "NativeProblem", "NativeStep", "Reference", "StepStatus"]
+if TYPE_CHECKING:
+    from bayesrace.controller.assembly import PathTable
 
+__all__ = ["PATH_COLUMNS", "Artefact", "NativeProblem", "NativeStep", "Reference", "StepStatus"]
+
+PATH_COLUMNS: Final = 7
+"""BR_PATH_COLUMNS in controller/native/bayesrace_mpc.h."""
 
 Reference = Floats
 """Parameters of the stages 1..N, shape (N, np), in the order of the manifest."""
@@ -137,6 +141,8 @@ class NativeProblem:
         )
         clock = ffi.addressof(self._library, "br_mpc_monotonic")
         self._check(self._library.br_mpc_set_clock(self.handle, clock, ffi.NULL), "clock")
+        self.weights_version = self._proven_version = ""
+        """Of the weights in use; empty while there is no correction."""
         self.load_weights(b"")
 
     def _made(self, *shape: int) -> tuple[Floats, Any]:
@@ -200,11 +206,12 @@ class NativeProblem:
             )
         return outputs
 
-    def load_weights(self, packed: bytes) -> None:
+    def load_weights(self, packed: bytes, version: str = "") -> None:
         """Uses weights (``bayesrace.gp.weights.pack_weights``) from the next step on; empty: no
         correction of the model. They are not compared with the manifest."""
         outputs = self._outputs(packed)
         self._check(self._library.br_mpc_set_weights(self.handle, outputs), "weights")
+        self.weights_version = self._proven_version = version
 
     def stage_weights(self, packed: bytes) -> None:
         """Copies weights beside those in use, for :meth:`adopt_weights`; else as
@@ -216,20 +223,23 @@ class NativeProblem:
         outputs = self._outputs(packed)
         self._check(self._library.br_mpc_stage_weights(self.handle, outputs), "weights")
 
-    def adopt_weights(self) -> None:
+    def adopt_weights(self, version: str = "") -> None:
         """Puts what is staged into use, between two steps; InputError if there is nothing.
 
         They are on probation: :meth:`watch` compares them with those that were proven before.
         """
         self._check(self._quick.br_mpc_adopt_weights(self._address), "weights")
+        self.weights_version = version
 
     def prove_weights(self) -> None:
         """Ends the probation of the weights in use."""
         self._check(self._quick.br_mpc_prove_weights(self._address), "weights")
+        self._proven_version = self.weights_version
 
     def revert_weights(self) -> None:
         """Goes back to the proven weights, between two steps."""
         self._check(self._quick.br_mpc_revert_weights(self._address), "weights")
+        self.weights_version = self._proven_version
 
     def watch(self) -> Any:
         """How the weights in use do beside the proven ones, a br_mpc_watch; overwritten by the
@@ -385,7 +395,7 @@ class NativeStep(NativeProblem):
         """Weights, limits and tolerances of the OCP; effective from the next step."""
         self.set_values(settings.parameters(car, self.manifest.problem.name))
 
-    def set_path(self, table: PathTable) -> None:
+    def set_path(self, table: "PathTable") -> None:
         """Racing line and track; copied."""
         rows = self._given("path table", table.rows, len(table.rows), PATH_COLUMNS)
         count = len(table.rows)
@@ -395,4 +405,4 @@ class NativeStep(NativeProblem):
     def set_weights(self, weights: GpWeights) -> None:
         """Uses the weights from the next step on; InputError if they are for another model."""
         weights.check_fit(self.manifest.discretisation, self.manifest.gp_capacity)
-        self.load_weights(pack_weights(weights))
+        self.load_weights(pack_weights(weights), weights.version)

@@ -110,9 +110,8 @@ class ControllerProcess:
         self._adoption: Adoption | None = None
         if controller.port is not None:
             self._weights = WeightUpdateManager(
-                session, self.name, controller.port, settings.gate,
-                user=controller, announce=self._service.announce,
-            )  # fmt: skip
+                session, self.name, controller.port, settings.gate, self._service.announce
+            )
             self._adoption = self._weights.adoption
         inbox.watch("plant")
         inbox.announce("controller")

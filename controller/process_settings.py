@@ -1,15 +1,19 @@
 """How a controller process is started."""
 
-from typing import Annotated
+from typing import Annotated, get_args
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from bayesrace.controller.settings import CompensationSettings, FallbackSettings
-from bayesrace.controller.weights.settings import GateSettings
+from bayesrace.controller.settings import (
+    CompensationMode,
+    CompensationSettings,
+    FallbackSettings,
+    GateSettings,
+)
 from bayesrace.defaults import Option
 from bayesrace.realtime import RealtimeSettings
 from bayesrace.transport import CONTROLLER_ENDPOINT, PLANT_ENDPOINT, Endpoints
-from bayesrace.vehicles import CarSetting, default_car
+from bayesrace.vehicles import CarParameters, CarSetting, default_car
 
 __all__ = ["ControllerSettings"]
 
@@ -47,3 +51,19 @@ class ControllerSettings(BaseModel):
     gate: GateSettings = GateSettings()
     realtime: RealtimeSettings = RealtimeSettings()
     parent_pid: int | None = Field(None, description="end when this process, the parent, ends")
+
+    def cycle_values(self, car: CarParameters) -> dict[str, float]:
+        """The numbers of br_driving (controller/native/bayesrace_cycle.h) by name, but limits."""
+        return {
+            **car.brake_numbers,
+            "standing_mps": car.tuning.driving.standing_mps,
+            "stop_mps2": car.tuning.driving.stop_mps2,
+            "shifted_s": self.fallback.shifted_s,
+            "limit_tolerance": self.fallback.tolerance,
+            "recover_cycles": self.fallback.recover_cycles,
+            "compensation": get_args(CompensationMode).index(self.compensation.mode),
+            "delay_s": self.compensation.delay_s,
+            "longest_s": self.compensation.longest_s,
+            "stale_s": self.stale_s,
+            "sensor_tolerance": self.sensor_tolerance,
+        }

@@ -13,7 +13,6 @@ from bayesrace.arrays import Floats
 from bayesrace.controller.driver import DOUBTED, STEP_FAILED
 from bayesrace.controller.interface import ControlLaw, Environment, StepOutput
 from bayesrace.controller.native_step import Artefact
-from bayesrace.errors import InputError
 
 __all__ = ["PythonController"]
 
@@ -65,18 +64,6 @@ class PythonController:
         pending, self._pending = self._pending, None
         if pending is not None:
             raise pending
-
-    def adopt_weights(self, version: str) -> None:
-        """Never asked."""
-        raise InputError("a control law in Python takes no weights")
-
-    def revert_weights(self, version: str) -> None:
-        """Never asked."""
-        raise InputError("a control law in Python takes no weights")
-
-    def set_weights(self, data: bytes) -> str:
-        """Always refused."""
-        raise InputError("a control law in Python takes no weights")
 
     def _caught(self, error: BaseException) -> None:
         """C knows no exceptions: what is raised is kept, and the cycle falls back."""

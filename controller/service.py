@@ -7,7 +7,6 @@ from typing import Any, Final
 
 from bayesrace.controller.driver import Driver, Level
 from bayesrace.controller.interface import Controller
-from bayesrace.errors import InputError
 from bayesrace.messages import (
     COMMAND,
     EVENT,
@@ -133,10 +132,9 @@ class Service:
             request.answer(self.status())
         elif request.service is COMMAND:
             self._command(request)
-        elif request.service is ROLLBACK:
-            request.reply(False, "this controller has no weights to go back to")
         else:
-            self._take_weights(request)
+            self._weights_refused += 1
+            request.reply(False, "a control law in Python takes no weights")
 
     def _command(self, request: Request) -> None:
         command, why_not = decode_request(request)
@@ -151,17 +149,6 @@ class Service:
             self._text = f"driving on request: {command.text}"
         self.announce(command.command, self._text, {})
         request.reply(True, self._text)
-
-    def _take_weights(self, request: Request) -> None:
-        data: dict[str, Scalar] = {}
-        try:
-            data["version"] = version = self._controller.set_weights(request.payload)
-            text = f"weights {version} in use from the next step on"
-        except InputError as error:
-            self._weights_refused += 1
-            text = str(error)
-        self.announce("weights_accepted" if data else "weights_refused", text, data)
-        request.reply(bool(data), text, data)
 
     def announce(self, kind: str, text: str, data: Mapping[str, Scalar]) -> None:
         """Publishes an event; from any thread."""

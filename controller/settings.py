@@ -1,8 +1,8 @@
-"""Run-time settings: of the OCP (paper, equation 8) and the SQP that solves it, and of the control
-cycle around the step, its fallback and delay compensation."""
+"""Run-time settings: of the OCP (paper, equation 8) and the SQP that solves it; of the control
+cycle around the step, its fallback and delay compensation; and of the checks of new weights."""
 
 from statistics import NormalDist
-from typing import Annotated, Any, Final, Literal, get_args
+from typing import Annotated, Any, Final, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
@@ -10,13 +10,15 @@ from bayesrace.defaults import Option
 from bayesrace.vehicles import CarParameters
 
 __all__ = [
-    "CompensationSettings",
-    "FallbackSettings",
-    "MpcSettings",
-    "cycle_values",
-    "input_limits",
-]
+    "SAMPLES", "WATCHED", "CompensationMode", "CompensationSettings", "FallbackSettings",
+    "GateSettings", "MpcSettings",
+]  # fmt: skip
 
+SAMPLES: Final = 512
+"""BR_SAMPLES in controller/native/bayesrace_mpc.h: what a controller keeps."""
+
+WATCHED: Final = 100
+"""BR_WATCHED there: the newest of these, on which weights are compared while they are watched."""
 
 _SOLVER: Final = ("tolerance", "defect_max", "early_stop_tol", "iterations", "iterations_cold")
 """BR_SOLVER_FIELDS in controller/native/bayesrace_mpc.h that have the names of settings."""
@@ -121,7 +123,7 @@ class FallbackSettings(BaseModel):
     )
 
 
-_Mode = Literal["off", "measured", "fixed"]
+CompensationMode = Literal["off", "measured", "fixed"]
 """In the order of br_compensation in controller/native/bayesrace_cycle.h."""
 
 
@@ -133,7 +135,7 @@ class CompensationSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    mode: _Mode = Field(
+    mode: CompensationMode = Field(
         "measured", description="off: the state is taken as it is, as if everything were at once"
     )
     delay_s: float = Field(0.0, ge=0, le=1, description="delay from decision to acting if fixed")
@@ -155,30 +157,42 @@ class CompensationSettings(BaseModel):
             raise ValueError(f"give {known}, not '{value}'") from None
 
 
-def cycle_values(
-    car: CarParameters,
-    fallback: FallbackSettings,
-    compensation: CompensationSettings,
-    stale_s: float,
-    sensor_tolerance: float,
-) -> dict[str, float]:
-    """The numbers of br_driving (controller/native/bayesrace_cycle.h) by name, limits left out."""
-    return {
-        **car.brake_numbers,
-        "standing_mps": car.tuning.driving.standing_mps,
-        "stop_mps2": car.tuning.driving.stop_mps2,
-        "shifted_s": fallback.shifted_s,
-        "limit_tolerance": fallback.tolerance,
-        "recover_cycles": fallback.recover_cycles,
-        "compensation": get_args(_Mode).index(compensation.mode),
-        "delay_s": compensation.delay_s,
-        "longest_s": compensation.longest_s,
-        "stale_s": stale_s,
-        "sensor_tolerance": sensor_tolerance,
-    }
+class GateSettings(BaseModel):
+    """When new weights are refused, and when they are rolled back.
 
+    One-step errors are compared as velocities after one Ts. The new weights are worse if for any
+    output
 
-def input_limits(car: CarParameters) -> dict[str, tuple[float, float]]:
-    """The limits of drive command and steering rate there."""
-    rate = car.delta_rate_max_radps
-    return {"u_low": (car.d_min, -rate), "u_high": (car.d_max, rate)}
+        error_new > worse_factor * error_old + worse_share * error_nominal + resolution * Ts * few
+
+    with RMSEs over the same samples and ``nominal`` the model without correction. ``resolution``
+    and the bound on corrections depend on the car: :class:`bayesrace.vehicles.tuning.GateTuning`.
+    ``few`` is 100, the samples that the watch compares on, over the number of samples, and at
+    least 1: a handful of samples, as after a standing start, must be far worse.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    worse_factor: float = Field(1.2, ge=1, description="errors may grow by this factor, and")
+    worse_share: float = Field(
+        0.1, ge=0, description="by this share of the nominal error: good weights learned again "
+        "differ by several times their error, which is small beside it",
+    )  # fmt: skip
+    plausible_states: int = Field(
+        500, ge=0, le=10_000, description="states over the car's range, for the bound"
+    )
+    least_samples: int = Field(
+        50, ge=1, le=SAMPLES, description="with fewer of the newest 512, only on probation"
+    )
+    watch_s: float = Field(10.0, ge=0, le=3600, description="driving after which weights stay")
+    watch_least: int = Field(
+        5, ge=1, le=WATCHED, description="samples: no rollback for one outlier"
+    )
+    watch_cycles: int = Field(
+        25, ge=1, le=5000, description="cycles, nearly all of them without a solution, after which "
+        "weights are rolled back: a car that stands has no error to compare",
+    )  # fmt: skip
+    slow_share: float = Field(
+        0.7, gt=0, le=1, description="of the fastest speed that was watched: the limit where going "
+        "back would be no better",
+    )  # fmt: skip

@@ -45,7 +45,7 @@ from bayesrace.messages import (
 )
 from bayesrace.operation.analysis.laps import LapTimes, Trajectory, time_laps
 from bayesrace.operation.drive import RunPlan, announcement, run_request
-from bayesrace.plant.lockstep import CarRun, End, Sensors, drive_lockstep, truth_behind
+from bayesrace.plant.car import CarRun, End, Sensors, drive_lockstep, truth_behind
 from bayesrace.plant.settings import SensorNoise
 from bayesrace.plant.simulator import Simulator
 from bayesrace.plant.vehicle import Vehicle

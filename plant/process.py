@@ -23,7 +23,7 @@ from bayesrace.messages import (
     Scalar,
     Status,
 )
-from bayesrace.plant.lockstep import End, Sensors
+from bayesrace.plant.car import End, Sensors
 from bayesrace.plant.process_settings import PlantSettings
 from bayesrace.plant.run import Run, RunCounters
 from bayesrace.plant.vehicle import Compile, FmuFault, Vehicle, open_vehicle

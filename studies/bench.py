@@ -25,9 +25,8 @@ from bayesrace.arrays import Floats
 from bayesrace.codegen.ocp import OcpNlp
 from bayesrace.codegen.problems.tracking import tracking
 from bayesrace.codegen.settings import ProblemName
-from bayesrace.controller.assembly import compiled_controller
+from bayesrace.controller.assembly import PredictiveController, compiled_controller
 from bayesrace.controller.cycle import Cycle
-from bayesrace.controller.mpc import PredictiveController
 from bayesrace.controller.native_step import NativeStep, StepStatus
 from bayesrace.controller.process_settings import ControllerSettings
 from bayesrace.controller.settings import MpcSettings
@@ -39,7 +38,7 @@ from bayesrace.operation.closed_loop import built_in_car
 from bayesrace.operation.drive import RunPlan, run_request
 from bayesrace.operation.preparation import prepare, progress_artefact
 from bayesrace.operation.terminal.terminal import Stages, plain_table
-from bayesrace.plant.lockstep import CarRun, drive_lockstep
+from bayesrace.plant.car import CarRun, drive_lockstep
 from bayesrace.plant.simulator import PLANT
 from bayesrace.plant.vehicle import Vehicle
 from bayesrace.studies.settings import PUBLISHED, BenchSettings

@@ -17,8 +17,8 @@ from bayesrace.arrays import Floats
 from bayesrace.codegen.build import build
 from bayesrace.codegen.problems.tracking import tracking
 from bayesrace.codegen.settings import BuildSettings
+from bayesrace.controller.assembly import PathTable, make_path_table
 from bayesrace.controller.native_step import NativeStep
-from bayesrace.controller.path_table import PathTable, make_path_table
 from bayesrace.controller.settings import MpcSettings
 from bayesrace.gp.expression import kernel_matrix
 from bayesrace.gp.weights import KERNELS, GpOutput, GpWeights

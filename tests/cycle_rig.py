@@ -7,8 +7,8 @@ from typing import Any
 from bayesrace.arrays import Floats
 from bayesrace.controller.driver import Driver
 from bayesrace.controller.interface import Environment, StepOutput
+from bayesrace.controller.process_settings import ControllerSettings
 from bayesrace.controller.python_controller import PythonController
-from bayesrace.controller.settings import CompensationSettings, FallbackSettings
 from bayesrace.messages import State
 from bayesrace.vehicles import CarParameters, default_car
 from tests import sample_messages as messages
@@ -47,23 +47,12 @@ class ScriptedLaw:
 
 
 def scripted_driver(
-    artefact: Path,
-    law: ScriptedLaw,
-    fallback: FallbackSettings | None = None,
-    compensation: CompensationSettings | None = None,
-    stale_s: float = 1e3,
-    car: CarParameters | None = None,
+    artefact: Path, law: ScriptedLaw, car: CarParameters | None = None, **settings: Any
 ) -> Driver:
-    """The car's, by default the default car's, driven by the law."""
-    controller = PythonController(artefact, law)
-    return Driver(
-        controller,
-        car or default_car(),
-        fallback or FallbackSettings(),
-        compensation or CompensationSettings(),
-        stale_s,
-        sensor_tolerance=0,  # the states of these rigs follow no kinematics
-    )
+    """The car's, by default the default car's, driven by the law; with settings of the process."""
+    # Without a monitor: the states of these rigs follow no kinematics.
+    chosen = ControllerSettings(**{"stale_s": 60.0, "sensor_tolerance": 0.0} | settings)
+    return Driver(PythonController(artefact, law), car or default_car(), chosen)
 
 
 def state(seq: int, **changes: Any) -> State:

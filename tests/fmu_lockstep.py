@@ -15,9 +15,10 @@ import pytest
 
 from bayesrace.arrays import Floats
 from bayesrace.codegen.fmu import FmuDefinition, controller_fmu, pack
+from bayesrace.controller.assembly import PredictiveController
 from bayesrace.controller.driver import Driver
-from bayesrace.controller.mpc import PredictiveController
 from bayesrace.controller.native_step import NativeStep, StepStatus
+from bayesrace.controller.process_settings import ControllerSettings
 from bayesrace.controller.settings import CompensationSettings, FallbackSettings
 from bayesrace.gp.weights import GpWeights
 from bayesrace.plant.simulator import Simulator
@@ -69,9 +70,10 @@ class Lockstep:
     def __post_init__(self) -> None:
         compensation = CompensationSettings(mode="fixed", delay_s=self.delay_s)
         controller = PredictiveController(self.native)
-        self.driver = Driver(
-            controller, self.car, FALLBACK, compensation, 0.06, False, self.tolerance
+        settings = ControllerSettings(
+            fallback=FALLBACK, compensation=compensation, sensor_tolerance=self.tolerance
         )
+        self.driver = Driver(controller, self.car, settings)
         self.plant = Simulator(dynamic(self.car))
 
     def answer(self, seq: int, x: Floats) -> Floats:

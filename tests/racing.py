@@ -8,8 +8,7 @@ from typing import Any
 from rich.console import Console
 
 from bayesrace.arrays import Floats
-from bayesrace.controller.assembly import compiled_controller
-from bayesrace.controller.mpc import PredictiveController
+from bayesrace.controller.assembly import PredictiveController, compiled_controller
 from bayesrace.gp.weights import GpWeights, read_weights
 from bayesrace.operation.closed_loop import ClosedLoop, Driven
 from bayesrace.operation.preparation import Prepared, prepare

@@ -14,11 +14,10 @@ from msgspec.structs import replace
 from bayesrace.codegen.build import HOST
 from bayesrace.codegen.compiler import find_compiler
 from bayesrace.codegen.host_files import SETTINGS_FILE, export
+from bayesrace.controller.assembly import PredictiveController
 from bayesrace.controller.driver import Level
-from bayesrace.controller.mpc import PredictiveController
 from bayesrace.controller.native_step import NativeStep
 from bayesrace.controller.process_settings import ControllerSettings
-from bayesrace.controller.settings import cycle_values
 from bayesrace.gp.weights import GpWeights
 from bayesrace.log import LogReader, LogWriter
 from bayesrace.manifest import read_manifest
@@ -58,10 +57,7 @@ def data(
 ) -> Path:
     """Racing line, weights and settings."""
     folder = tmp_path_factory.mktemp("data")
-    process = ControllerSettings()
-    values = SETTINGS.parameters(car) | cycle_values(
-        car, process.fallback, process.compensation, process.stale_s, process.sensor_tolerance
-    )
+    values = SETTINGS.parameters(car) | ControllerSettings().cycle_values(car)
     table = circuit.table
     export(folder, read_manifest(kinematic_artefact), table.rows, table.spacing_m, values, weights)
     return folder

@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bayesrace.controller.assembly import compiled_controller
-from bayesrace.controller.mpc import PredictiveController
+from bayesrace.controller.assembly import PredictiveController, compiled_controller
 from bayesrace.controller.pure_pursuit import PurePursuit, PurePursuitSettings
 from bayesrace.controller.python_controller import PythonController
 from bayesrace.controller.settings import MpcSettings

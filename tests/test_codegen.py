@@ -29,8 +29,7 @@ from bayesrace.controller.driver import (
     Phase,
 )
 from bayesrace.controller.native_step import Artefact, NativeStep, StepStatus
-from bayesrace.controller.settings import MpcSettings
-from bayesrace.controller.weights.settings import SAMPLES, WATCHED
+from bayesrace.controller.settings import SAMPLES, WATCHED, MpcSettings
 from bayesrace.errors import InputError
 from bayesrace.integrators import PERFECT, PREDICTION, Discretisation
 from bayesrace.manifest import LIBRARY, MANIFEST, read_manifest

@@ -12,7 +12,7 @@ from bayesrace.controller.settings import CompensationSettings, MpcSettings
 from bayesrace.gp.weights import GpWeights
 from bayesrace.messages import RunRequest
 from bayesrace.operation.closed_loop import ClosedLoop, Driven
-from bayesrace.plant.lockstep import CarRun, Sensors
+from bayesrace.plant.car import CarRun, Sensors
 from bayesrace.plant.settings import SensorNoise
 from bayesrace.plant.simulator import Simulator
 from bayesrace.vehicles import CarParameters

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from bayesrace.arrays import Floats
+from bayesrace.controller.assembly import PredictiveController
 from bayesrace.controller.driver import (
     HALTED,
     NO_STATE,
@@ -20,18 +21,17 @@ from bayesrace.controller.driver import (
     Phase,
 )
 from bayesrace.controller.interface import Environment, StepOutput
-from bayesrace.controller.mpc import PredictiveController
 from bayesrace.controller.native_step import NativeStep, StepStatus
-from bayesrace.controller.settings import CompensationSettings, FallbackSettings
+from bayesrace.controller.process_settings import ControllerSettings
+from bayesrace.controller.settings import CompensationSettings
 from bayesrace.messages import State
-from bayesrace.vehicles import CarParameters, default_car
+from bayesrace.vehicles import default_car, get_car
 from bayesrace.vehicles.models import dynamic
 from tests import sample_messages as messages
 from tests.conftest import SETTINGS, Circuit, discrete
 from tests.cycle_rig import ScriptedLaw, scripted_driver, state
 
 STEP_S = 0.02
-STALE_S = 0.06
 
 
 class Rig:
@@ -47,16 +47,13 @@ class Rig:
     ) -> None:
         """``sensor_tolerance`` 0: every state is believed."""
         self.controller = PredictiveController(native)
-        car = native_car(native)
-        self.driver = Driver(
-            self.controller,
-            car,
-            FallbackSettings(recover_cycles=3),
-            CompensationSettings(mode="fixed", delay_s=delay_s),
-            STALE_S,
-            hold,
-            sensor_tolerance,
+        car = get_car(native.manifest.car)
+        settings = ControllerSettings(
+            compensation=CompensationSettings(mode="fixed", delay_s=delay_s),
+            hold=hold,
+            sensor_tolerance=sensor_tolerance,
         )
+        self.driver = Driver(self.controller, car, settings)
         self.plant = discrete(dynamic(car))
         self.x = circuit.start(v_mps=1.5)
         self.u = np.zeros(2)
@@ -91,12 +88,6 @@ class Rig:
         self.u = np.array([decision.d, decision.delta_rate])
         self.x = self.plant(self.x, self.u)
         self.seq += 1
-
-
-def native_car(native: NativeStep) -> CarParameters:
-    from bayesrace.vehicles import get_car
-
-    return get_car(native.manifest.car)
 
 
 @pytest.fixture
@@ -191,7 +182,7 @@ def test_silence_after_such_a_state_ends_at_a_level_too(
 def test_a_budget_too_small_for_a_plan_steps_down(rig: Rig, native: NativeStep) -> None:
     """The first step of a drive is cold: one iteration, which is always done, is not enough."""
     strict = SETTINGS.model_copy(update={"defect_max": 1e-9})
-    native.set_parameters(native_car(native), strict)
+    native.set_parameters(get_car(native.manifest.car), strict)
     decision = rig.cycle(budget_s=1e-9)
     assert decision.status == StepStatus.TIME_LIMIT
     assert decision.level is Level.BRAKE

@@ -12,7 +12,6 @@ from bayesrace.codegen.fmu import car_fmu, pack
 from bayesrace.codegen.settings import BuildSettings
 from bayesrace.controller.pure_pursuit import PurePursuit
 from bayesrace.controller.python_controller import PythonController
-from bayesrace.controller.settings import FallbackSettings
 from bayesrace.gp.weights import GpWeights, read_weights
 from bayesrace.integrators import PREDICTION
 from bayesrace.learning.settings import TrainingSettings
@@ -130,7 +129,7 @@ def test_first_weights_outlast_a_standing_start_if_they_are_good(
 def braked_by_fallback(x0: Floats) -> tuple[Floats, list[int]]:
     """States until the car stands, no step usable any more; how many cycles each level drove."""
     artefact = build(BuildSettings(car=CAR))[0]
-    driver = scripted_driver(artefact, ScriptedLaw(), FallbackSettings(), car=CAR)
+    driver = scripted_driver(artefact, ScriptedLaw(), CAR)
     simulator = Simulator(dynamic(CAR))
     simulator.reset(x0.tolist())
     rows = [x0]

@@ -28,7 +28,7 @@ class Fallback:
 
     def __init__(self, artefact: Path, chosen: FallbackSettings) -> None:
         self._law = ScriptedLaw()
-        self._driver = scripted_driver(artefact, self._law, chosen)
+        self._driver = scripted_driver(artefact, self._law, fallback=chosen)
         self._seq = 0
         self._run = 1
 

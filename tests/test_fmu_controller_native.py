@@ -12,7 +12,7 @@ from bayesrace.codegen import host_files
 from bayesrace.codegen.build import HOST
 from bayesrace.codegen.build import NATIVE as HEADERS
 from bayesrace.codegen.host_files import PATH_FILE, WEIGHTS_FILE, path_file, weights_file
-from bayesrace.controller import driver, path_table
+from bayesrace.controller import assembly, driver, native_step
 from bayesrace.controller.native_step import StepStatus
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import GpWeights
@@ -25,8 +25,8 @@ from tests.native_programs import PROGRAMS, SANITIZED, native_program
 @pytest.mark.parametrize(
     ("macro", "values"),
     [
-        ("BR_PATH_COLUMNS", {path_table.PATH_COLUMNS, host_files.PATH_COLUMNS}),
-        ("BR_PATH_CAPACITY", {path_table.CAPACITY, host_files.PATH_CAPACITY}),
+        ("BR_PATH_COLUMNS", {native_step.PATH_COLUMNS, host_files.PATH_COLUMNS}),
+        ("BR_PATH_CAPACITY", {assembly.CAPACITY, host_files.PATH_CAPACITY}),
     ],
 )
 def test_sizes_and_limits_of_the_native_step_are_those_that_python_states(

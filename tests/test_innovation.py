@@ -8,11 +8,11 @@ import pytest
 from rich.console import Console
 
 from bayesrace.arrays import Floats
-from bayesrace.controller.assembly import compiled_controller
+from bayesrace.controller.assembly import PredictiveController, compiled_controller
 from bayesrace.controller.driver import Driver
-from bayesrace.controller.mpc import PredictiveController
 from bayesrace.controller.native_step import NativeStep
-from bayesrace.controller.settings import CompensationSettings, FallbackSettings, MpcSettings
+from bayesrace.controller.process_settings import ControllerSettings
+from bayesrace.controller.settings import MpcSettings
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import GpWeights, read_weights
 from bayesrace.integrators import PREDICTION
@@ -169,8 +169,8 @@ class TestCycle:
     @pytest.fixture
     def loop(self, step: NativeStep, car: CarParameters) -> Driver:
         """Its sensors are trusted: what these states say contradicts itself."""
-        settings = FallbackSettings(), CompensationSettings(), 0.1
-        return Driver(PredictiveController(step), car, *settings, sensor_tolerance=0)
+        settings = ControllerSettings(stale_s=0.1, sensor_tolerance=0)
+        return Driver(PredictiveController(step), car, settings)
 
     @staticmethod
     def widening(driver: Driver, states: list[State]) -> float:

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from bayesrace.arrays import Floats
+from bayesrace.controller.assembly import PathTable, make_path_table
 from bayesrace.controller.native_step import NativeStep
-from bayesrace.controller.path_table import PathTable, make_path_table
 from bayesrace.controller.settings import MpcSettings
 from bayesrace.errors import InputError
 from bayesrace.vehicles import CarParameters, default_car

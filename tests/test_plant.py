@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from bayesrace.codegen.compiler import Compiler, compiled
 from bayesrace.errors import InputError
 from bayesrace.integrators import Discretisation
-from bayesrace.plant.lockstep import LineCounter
+from bayesrace.plant.car import LineCounter
 from bayesrace.plant.simulator import Simulator
 from bayesrace.vehicles import get_car
 from bayesrace.vehicles.models import dynamic

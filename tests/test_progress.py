@@ -10,9 +10,9 @@ from bayesrace.arrays import Floats
 from bayesrace.codegen.build import build, problem_of
 from bayesrace.codegen.ocp import OcpNlp
 from bayesrace.codegen.settings import BuildSettings
+from bayesrace.controller.assembly import PathTable, make_path_table
 from bayesrace.controller.interface import NO_LIMITS, Environment
 from bayesrace.controller.native_step import NativeStep, StepStatus
-from bayesrace.controller.path_table import PathTable, make_path_table
 from bayesrace.controller.settings import MpcSettings
 from bayesrace.gp.expression import corrected_function
 from bayesrace.gp.weights import GpWeights

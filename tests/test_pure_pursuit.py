@@ -1,7 +1,6 @@
 """The data-collecting driver: laps complete, limits hold, the car is excited, seeds repeat."""
 
 import math
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -129,9 +128,3 @@ def test_a_car_far_from_where_it_was_finds_the_line_again() -> None:
 def test_an_unusable_line_is_refused(line: Any, fault: str) -> None:
     with pytest.raises(InputError, match=fault):
         PurePursuit(CAR, *line)
-
-
-def test_weights_are_refused(kinematic_artefact: Path) -> None:
-    controller = PythonController(kinematic_artefact, PurePursuit(CAR, *oval()))
-    with pytest.raises(InputError, match="takes no weights"):
-        controller.set_weights(b"")

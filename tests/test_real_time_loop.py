@@ -21,8 +21,8 @@ from bayesrace.arrays import Floats
 from bayesrace.controller.interface import Environment, StepOutput
 from bayesrace.controller.process import ControllerProcess, ControllerSettings
 from bayesrace.controller.python_controller import PythonController
-from bayesrace.controller.weights.adoption import Adoption, Offer
-from bayesrace.controller.weights.settings import GateSettings
+from bayesrace.controller.settings import GateSettings
+from bayesrace.controller.weights.adoption import Adoption, Task
 from bayesrace.messages import Actuation, State, Telemetry, decode, encode
 from bayesrace.transport import Item, Kind, inbox, publisher
 from bayesrace.vehicles import get_car
@@ -258,22 +258,20 @@ def test_new_weights_come_after_both_cycles_of_a_release(
     def adopt(version: str) -> None:
         driven.controller.weights_version = version
 
-    user: Any = SimpleNamespace(adopt_weights=adopt)
-    native = SimpleNamespace(manifest=SimpleNamespace(step_s=0.02), prove_weights=lambda: None)
-    known = SimpleNamespace(version="", proven=True)
-    history = SimpleNamespace(in_use=known, reference=known)
+    native = SimpleNamespace(adopt_weights=adopt, prove_weights=lambda: None)
+    history = SimpleNamespace(in_use=SimpleNamespace(proven=True))
     port: Any = SimpleNamespace(step=native, car=get_car("orca"), history=history)
-    adoption = driven.process._adoption = Adoption(port, GateSettings(), user)
-    offer = Offer("new", 0, watched=False)
+    adoption = driven.process._adoption = Adoption(port, GateSettings())
+    task = Task(lambda: adoption.adopt("new", watched=False), 0)
     step = driven.law.step
 
     def offering(*arguments: Any) -> StepOutput:
         if len(driven.telemetry) == 8:  # in the cycle before the late one
-            adoption.offers.append(offer)
+            adoption.tasks.append(task)
         return step(*arguments)
 
     monkeypatch.setattr(driven.law, "step", offering)
     driven.run(20, {8: 9 * MS})
     drives = [one.weights_version == "new" for one in driven.actuations]
     assert drives == [False] * 10 + [True] * 11
-    assert (offer.done, offer.cycle) == (True, driven.telemetry[10].tick)
+    assert list(adoption.done) == [(driven.telemetry[10].tick, task)]

@@ -20,7 +20,7 @@ from bayesrace.operation.analysis.race import analyse, read_race
 from bayesrace.operation.analysis.results import RaceResult
 from bayesrace.operation.analysis.validation import validate_weights
 from bayesrace.operation.closed_loop import ClosedLoop, Driven
-from bayesrace.plant.lockstep import Sensors
+from bayesrace.plant.car import Sensors
 from bayesrace.vehicles import CarParameters
 from bayesrace.vehicles.models import dynamic
 from tests.conftest import Circuit

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from bayesrace.arrays import Floats
+from bayesrace.controller.assembly import make_path_table
 from bayesrace.controller.interface import Environment
 from bayesrace.controller.native_step import NativeStep
-from bayesrace.controller.path_table import make_path_table
 from bayesrace.tracks import Track
 from bayesrace.vehicles import CarParameters, default_car
 from tests.conftest import SETTINGS, Circuit, offset_line

@@ -20,7 +20,7 @@ from bayesrace.messages import (
 )
 from bayesrace.realtime import SUSPENDED_S, suspension
 from bayesrace.transport.inbox import Inbox, Item, Kind
-from bayesrace.transport.requests import ask, count_processes, send_rollback, send_weights
+from bayesrace.transport.requests import ask, count_processes, send_weights
 
 __all__ = ["Director", "RefusedError"]
 
@@ -104,10 +104,6 @@ class Director:
     def send_weights(self, data: bytes) -> Reply:
         """:func:`send_weights`; RefusedError with the reasons if they are refused."""
         return _accepted("weights", send_weights(self._session, self._car, data))
-
-    def rollback(self, text: str) -> Reply:
-        """:func:`send_rollback`; RefusedError without previous weights."""
-        return _accepted("rollback", send_rollback(self._session, self._car, text))
 
     def wait_for_end(
         self,

@@ -83,7 +83,7 @@ def controller_fmu(
     """The controller of a built artefact on one racing line, ready for
     :func:`bayesrace.codegen.fmu.pack`.
 
-    ``rows`` (n, 7), ``spacing_m``: the table of ``bayesrace.controller.path_table``; ``settings``:
+    ``rows`` (n, 7), ``spacing_m``: the table of ``bayesrace.controller.assembly``; ``settings``:
     the parameters of problem and solver (``bayesrace.controller.settings.MpcSettings.parameters``);
     ``fallback``: the fields of ``FallbackSettings``; both become start values of parameters. Built
     by the same compiler, it gives the bits of the artefact's own library on the same processor.

@@ -9,5 +9,5 @@ The modules in the order in which a weights file passes them:
    (controller/native/br_watch.c), so that going back is an exchange, too.
 4. :mod:`.store` keeps what has been accepted.
 
-:mod:`.comparison` compares weights by their errors, :mod:`.settings` has the thresholds.
+:class:`bayesrace.controller.settings.GateSettings` has the thresholds.
 """

@@ -8,22 +8,22 @@ wakes another thread either: that would cost a hundred times the adoption.
 import math
 import time
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Literal, NamedTuple
 
-from bayesrace.controller.interface import Controller, Environment
+from bayesrace.controller.interface import Environment
 from bayesrace.controller.native_step import NativeStep
-from bayesrace.controller.weights.checks import Samples
-from bayesrace.controller.weights.comparison import compare, slack_of
-from bayesrace.controller.weights.settings import WATCHED, GateSettings
+from bayesrace.controller.settings import WATCHED, GateSettings
+from bayesrace.controller.weights.checks import compare, slack_of
 from bayesrace.controller.weights.store import History, Store
 from bayesrace.errors import InputError
 from bayesrace.messages import Scalar
 from bayesrace.vehicles import CarParameters
 from bayesrace.vehicles.parts import GRAVITY_MPS2
 
-__all__ = ["Adoption", "Offer", "Ruling", "Watch", "WeightsPort", "limits_at", "slowed_down"]
+__all__ = ["Adoption", "Ruling", "Task", "Watch", "WeightsPort"]
 
 _BEND: Final = 5.0
 """Wheelbases: radius of the bend that a car still takes at its limit where it is slowed down."""
@@ -44,38 +44,15 @@ class WeightsPort:
 
 
 @dataclass(eq=False)
-class Offer:
-    """Staged weights; the control thread fills in the result of their adoption."""
+class Task:
+    """What the control thread is to do between two cycles; it fills in the result."""
 
-    version: str
+    work: Callable[[], Any]
     reverted: int
-    """:attr:`Adoption.reverted` when they were offered: the watch has not gone back since."""
-    watched: bool = True
-    """They are on probation; else they count as proven."""
-    done: bool = False
+    """:attr:`Adoption.reverted` when it was asked for: the watch has not gone back since."""
+    result: Any = None
     error: str = ""
-    """Why they could not be adopted; else empty."""
-    cycle: int = 0
-    """First cycle that they can drive."""
-    ruled: int = 0
-    """Rulings of the watch before."""
-    us: float = 0.0
-    """Time that the adoption has taken."""
-
-
-def slowed_down(settings: GateSettings, car: CarParameters, fastest_mps: float) -> Environment:
-    """The limit of a car that has driven so fast with weights that are worse for it."""
-    bend_m = _BEND * car.wheelbase_m
-    least_mps = math.sqrt(car.friction * GRAVITY_MPS2 * bend_m)
-    limit_mps = max(settings.slow_share * fastest_mps, least_mps)
-    return Environment(limit_mps, car.tuning.driving.stop_mps2)
-
-
-def limits_at(vx_mps: float, slow: Environment) -> Environment:
-    """The limit in a cycle: a faster car slows down from its own speed."""
-    if vx_mps > slow.speed_limit_mps:
-        return slow._replace(speed_limit_mps=vx_mps)
-    return slow._replace(speed_limit_rate_mps2=0.0)
+    """Why it could not be done; else empty."""
 
 
 class Ruling(NamedTuple):
@@ -149,86 +126,88 @@ class Watch:
 
 
 class Adoption:
-    """Holds one offer at most: the update manager makes it, the control thread adopts it."""
+    """Holds one task at most: the update manager sets it, the control thread does it."""
 
-    def __init__(self, port: WeightsPort, settings: GateSettings, user: Controller) -> None:
-        self._step, self._car, self._settings, self._user = port.step, port.car, settings, user
-        self._version, self._proven = port.history.in_use.version, port.history.reference.version
-        self.watch: Watch | None = None
-        if not port.history.in_use.proven:
-            self.watch = self._new_watch()
-        self.offers: deque[Offer] = deque(maxlen=1)
+    def __init__(self, port: WeightsPort, settings: GateSettings) -> None:
+        self._step, self._car, self._settings = port.step, port.car, settings
+        self._watch = None if port.history.in_use.proven else self._new_watch()
+        self.tasks: deque[Task] = deque(maxlen=1)
         """The manager appends, and pops what the control thread does not take."""
-        self.rulings: deque[tuple[int, Ruling]] = deque()
-        """What the watch has found and the control thread has done, with the next cycle's number;
-        the manager takes them."""
-        self.ruled = self.reverted = 0
-        """Rulings so far; and those by which the watch has gone back."""
-        self.samples_wanted = False
-        """The manager asks for ``samples``, which the control thread copies."""
-        self.samples: Samples | None = None
+        self.done: deque[tuple[int, Task | Ruling]] = deque()
+        """Tasks done, and what the watch has found and the control thread has done, in order, each
+        with the next cycle's number; the manager takes them."""
+        self.reverted = 0
+        """Rulings by which the watch has gone back."""
         self.slow: Environment | None = None
         """Largest speed with the weights in use, and how fast to slow down to it. None: no
         limit."""
-        self.longest_us = 0.0
+        self.us = self.longest_us = 0.0
+        """Duration of the newest adoption, and of the longest."""
 
     def _new_watch(self) -> Watch:
         return Watch(self._settings, self._car, self._step.manifest.step_s)
 
     def observe(self, vx_mps: float, fallen_back: bool | None) -> None:
         """A state; ``fallen_back``: see :meth:`Watch.observe`."""
-        if self.watch is not None:
-            self.watch.observe(vx_mps, fallen_back)
+        if self._watch is not None:
+            self._watch.observe(vx_mps, fallen_back)
 
     def limits(self, vx_mps: float) -> Environment | None:
-        """What limits the car in the next cycle."""
-        return None if self.slow is None else limits_at(vx_mps, self.slow)
+        """What limits the car in the next cycle: a faster one slows down from its own speed."""
+        slow = self.slow
+        if slow is None:
+            return None
+        if vx_mps > slow.speed_limit_mps:
+            return slow._replace(speed_limit_mps=vx_mps)
+        return slow._replace(speed_limit_rate_mps2=0.0)
 
     def between_cycles(self, cycle: int) -> None:
-        """Acts on what the watch finds, then on what is offered; ``cycle``: number of the next."""
-        if self.samples_wanted:
-            self.samples, self.samples_wanted = Samples(*self._step.samples()), False
-        if self.watch is not None:
-            ruling = self.watch.look(self._step.watch())
+        """Acts on what the watch finds, then on the task; ``cycle``: number of the next."""
+        if self._watch is not None:
+            ruling = self._watch.look(self._step.watch())
             if ruling is not None:
                 self._rule(ruling)
-                self.ruled += 1
-                self.rulings.append((cycle, ruling))
-        if self.offers:
-            self._take(cycle)
+                self.done.append((cycle, ruling))
+        if self.tasks:
+            self._do(cycle)
 
-    def _rule(self, ruling: Ruling) -> None:
-        if ruling.action == "slow":
-            fastest_mps = float(ruling.data["fastest_mps"])
-            self.slow = slowed_down(self._settings, self._car, fastest_mps)
-            return
-        self.watch = None
-        if ruling.action == "proven":
-            self._step.prove_weights()
-            self._proven = self._version
-        else:
-            self.reverted += 1
-            self._user.revert_weights(self._proven)
-            self._version = self._proven
-
-    def _take(self, cycle: int) -> None:
-        begin_ns = time.perf_counter_ns()
+    def _do(self, cycle: int) -> None:
         try:
-            offer = self.offers.popleft()
+            task = self.tasks.popleft()
         except IndexError:  # withdrawn at this moment
             return
         try:
-            if offer.reverted != self.reverted:
+            if task.reverted != self.reverted:
                 raise InputError("the watch has rolled back meanwhile; send them again")
-            self._user.adopt_weights(offer.version)
-            self._version = offer.version
-            if not offer.watched:
-                self._step.prove_weights()
-                self._proven = offer.version
-            self.watch, self.slow = self._new_watch() if offer.watched else None, None
+            task.result = task.work()
         except InputError as error:
-            offer.error = str(error)
-        offer.cycle, offer.ruled = cycle, self.ruled
-        offer.us = (time.perf_counter_ns() - begin_ns) * 1e-3
-        self.longest_us = max(self.longest_us, offer.us)
-        offer.done = True
+            task.error = str(error)
+        self.done.append((cycle, task))
+
+    def adopt(self, version: str, watched: bool) -> None:
+        """Uses staged weights; not ``watched``, they count as proven. For the control thread."""
+        begin_ns = time.perf_counter_ns()
+        self._step.adopt_weights(version)
+        if not watched:
+            self._step.prove_weights()
+        self._watch, self.slow = self._new_watch() if watched else None, None
+        self.us = (time.perf_counter_ns() - begin_ns) * 1e-3
+        self.longest_us = max(self.longest_us, self.us)
+
+    def _rule(self, ruling: Ruling) -> None:
+        if ruling.action == "slow":
+            self.slow = self._slowed_down(float(ruling.data["fastest_mps"]))
+            return
+        self._watch = None
+        if ruling.action == "proven":
+            self._step.prove_weights()
+        else:
+            self.reverted += 1
+            self._step.revert_weights()
+
+    def _slowed_down(self, fastest_mps: float) -> Environment:
+        """The limit of a car that has driven so fast with weights that are worse for it."""
+        bend_m = _BEND * self._car.wheelbase_m
+        least_mps = math.sqrt(self._car.friction * GRAVITY_MPS2 * bend_m)
+        limit_mps = max(self._settings.slow_share * fastest_mps, least_mps)
+        return Environment(limit_mps, self._car.tuning.driving.stop_mps2)

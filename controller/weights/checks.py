@@ -9,9 +9,9 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
+from itertools import product
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -20,11 +20,9 @@ import numpy as np
 
 from bayesrace.arrays import Floats
 from bayesrace.controller.native_step import NativeStep
-from bayesrace.controller.settings import MpcSettings
-from bayesrace.controller.weights.comparison import compare, slack_of
-from bayesrace.controller.weights.settings import GateSettings
+from bayesrace.controller.settings import WATCHED, GateSettings, MpcSettings
 from bayesrace.errors import InputError
-from bayesrace.gp.weights import FEATURES, OUTPUTS, GpWeights, decode_weights, pack_weights
+from bayesrace.gp.weights import FEATURES, OUTPUTS, UNITS, GpWeights, decode_weights, pack_weights
 from bayesrace.messages import Scalar
 from bayesrace.processes import RUN_MODULE, die_with_parent
 from bayesrace.vehicles import described_car
@@ -32,14 +30,9 @@ from bayesrace.vehicles.parameters import CarParameters
 from bayesrace.vehicles.parts import GRAVITY_MPS2
 
 __all__ = [
-    "NO_SAMPLES",
-    "Checks",
-    "Correction",
-    "Samples",
-    "Verdict",
-    "judged",
-    "plausible_features",
-]
+    "NO_SAMPLES", "Checks", "Correction", "Samples", "Verdict", "compare", "judged",
+    "plausible_features", "slack_of",
+]  # fmt: skip
 
 _CLOCKS_APART_S: Final = 3600.0
 """By which the clock of the training host may be ahead."""
@@ -49,7 +42,8 @@ _MOST: Final = 15.0
 """Times its usable acceleration, no car corners: more than the 1:43 car at full lock and speed."""
 _NICE: Final = 10
 """Of the process, below the controller."""
-_POLL_S: Final = 0.02
+_LARGEST: Final = 1e12
+"""Errors that are not finite count as this large."""
 
 
 class Samples(NamedTuple):
@@ -251,39 +245,73 @@ def _rms(errors: Floats) -> Floats:
     return squares
 
 
+class Comparison(NamedTuple):
+    """One-step errors of new weights and others over the same samples."""
+
+    worse: str
+    """Outputs for which the new weights are worse, by :class:`GateSettings`; empty: none."""
+    text: str
+    data: dict[str, Scalar]
+    """The number of ``samples``, and errors such as ``error_new_vx``."""
+
+
+def slack_of(car: CarParameters, step_s: float) -> Floats:
+    """What errors may differ by in any case (3,): the resolution of measurements."""
+    return np.array(car.tuning.gate.resolution) * step_s
+
+
+def compare(
+    settings: GateSettings,
+    slack: Floats,
+    samples: int,
+    new: Sequence[float] | Floats,
+    old: Sequence[float] | Floats,
+    nominal: Sequence[float] | Floats,
+) -> Comparison:
+    """New weights against old ones, and against none, by their errors (3,) on so many samples."""
+    rmse = {
+        what: np.minimum(np.asarray(errors, dtype=np.float64), _LARGEST)
+        for what, errors in (("new", new), ("old", old), ("nominal", nominal))
+    }
+    # The excess over a whole window is what counts: fewer samples must be worse by as much in all.
+    few = max(WATCHED / max(samples, 1), 1.0)
+    allowed = settings.worse_factor * rmse["old"] + settings.worse_share * rmse["nominal"]
+    # As large as can be on both sides is worse, too.
+    fine = (rmse["new"] <= allowed + few * slack) & (rmse["new"] < _LARGEST)
+    worse = " and ".join(name for name, good in zip(OUTPUTS, fine, strict=True) if not good)
+    data: dict[str, Scalar] = {"samples": samples}
+    for (what, errors), (j, name) in product(rmse.items(), enumerate(OUTPUTS)):
+        data[f"error_{what}_{name}"] = float(errors[j])
+    changes = ", ".join(
+        f"{name} {rmse['old'][j]:.4g} to {rmse['new'][j]:.4g} {UNITS[name]}"
+        for j, name in enumerate(OUTPUTS)
+    )
+    return Comparison(worse, f"one-step errors over {samples} samples go from {changes}", data)
+
+
 # The process -------------------------------------------------------------------------------------
 
 
-def judged(question: Mapping[str, Any], until_s: float, follow: Callable[[], None]) -> Any:
+def judged(question: Mapping[str, Any], until_s: float) -> Any:
     """The fields of a :class:`Verdict` on the question, from another process.
 
     ``question``: artefact and car (texts), settings (JSON), features and residuals of the recent
     samples (bytes), the files and the time of :meth:`Checks.judge` by name. ``until_s``: deadline
-    on the monotonic clock, when the process is killed. ``follow`` is called meanwhile. InputError
-    without a verdict.
+    on the monotonic clock, when the process is killed. InputError without a verdict.
     """
     line = [*RUN_MODULE, __name__, str(os.getpid())]
-    pipes: Any = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
+    asked, left_s = msgpack.packb(question), max(until_s - time.monotonic(), 0.0)
     try:
-        process = subprocess.Popen(line, **pipes)
+        ended = subprocess.run(line, input=asked, capture_output=True, timeout=left_s, check=False)
     except OSError as error:
         raise InputError(f"no process to check them: {error.strerror}") from None
-    with process, ThreadPoolExecutor(1) as pool:
-        exchanged = pool.submit(process.communicate, msgpack.packb(question))
-        try:
-            while not exchanged.done():
-                if time.monotonic() > until_s:
-                    raise InputError("the check of the weights did not end in time")
-                follow()
-                time.sleep(_POLL_S)
-        finally:
-            process.kill()
-        answer, words = exchanged.result()
-    if process.returncode:
-        last = words.decode(errors="replace").strip().splitlines()[-1:]
-        how = f"ended with code {process.returncode}"
+    except subprocess.TimeoutExpired:
+        raise InputError("the check of the weights did not end in time") from None
+    if ended.returncode:
+        last = ended.stderr.decode(errors="replace").strip().splitlines()[-1:]
+        how = f"ended with code {ended.returncode}"
         raise InputError(f"the check of the weights {': '.join([how, *last])}")
-    return msgpack.unpackb(answer)
+    return msgpack.unpackb(ended.stdout)
 
 
 def main() -> int:

@@ -5,12 +5,9 @@ history. Every file appears whole or not at all.
 """
 
 import hashlib
-import threading
 import time
-from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
-from queue import Full, Queue
 from typing import Annotated, Final, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -19,7 +16,7 @@ from bayesrace.errors import InputError
 from bayesrace.files import read_text, read_whole, write_whole
 from bayesrace.gp.weights import MAX_BYTES, decode_weights, pack_weights
 
-__all__ = ["HISTORY", "AcceptedWeights", "History", "Store", "StoreWriter", "digest_of"]
+__all__ = ["HISTORY", "AcceptedWeights", "History", "Store", "digest_of"]
 
 HISTORY: Final = 8
 """Accepted weights that are kept."""
@@ -47,11 +44,7 @@ class AcceptedWeights(BaseModel):
     proven: bool = Field(description="not watched, or no longer")
     accepted_utc_ns: int = Field(0, ge=0, description="since 1970; 0: not known")
     data: bytes = Field(b"", exclude=True, repr=False, description="empty: without correction")
-
-    @property
-    def packed(self) -> bytes:
-        """Their arrays for the compiled step."""
-        return pack_weights(decode_weights(self.data)) if self.data else b""
+    packed: bytes = Field(b"", exclude=True, repr=False, description="arrays of the compiled step")
 
     @property
     def file(self) -> str:
@@ -80,11 +73,11 @@ class History(BaseModel):
         """The newest proven weights: the watch compares with them and returns to them."""
         return next(one for one in reversed(self.entries) if one.proven)
 
-    def accept(self, version: str, data: bytes, proven: bool) -> AcceptedWeights:
+    def accept(self, version: str, data: bytes, packed: bytes, proven: bool) -> AcceptedWeights:
         """Puts new weights into use, under the next number."""
         new = AcceptedWeights(
             number=self.next_number, version=version, digest=digest_of(data), proven=proven,
-            accepted_utc_ns=time.time_ns(), data=data,
+            accepted_utc_ns=time.time_ns(), data=data, packed=packed,
         )  # fmt: skip
         self.next_number += 1
         reference, kept = self.reference, [*self.entries, new][-HISTORY:]
@@ -133,9 +126,9 @@ class Store:
         for one in self._index.entries:
             with suppress(InputError):
                 data = read_whole(self._folder / one.file, "weights file", MAX_BYTES)
-                decode_weights(data)
+                packed = pack_weights(decode_weights(data))
                 if digest_of(data) == one.digest:
-                    entries.append(one.model_copy(update={"data": data}))
+                    entries.append(one.model_copy(update={"data": data, "packed": packed}))
         return self._index.model_copy(update={"entries": entries})
 
     def keep(self, history: History) -> None:
@@ -156,36 +149,3 @@ class Store:
             write_whole(self._folder / name, data)
         except OSError as error:
             raise InputError(f"store {self._folder / name}: {error.strerror or error}") from None
-
-
-class StoreWriter:
-    """Writes a history to its store in a daemon thread: a disk may hang, even at the end."""
-
-    def __init__(self, store: Store, history: History, failed: Callable[[str], None]) -> None:
-        """``failed`` is called, in that thread, with the reason why weights are not kept."""
-        self._store, self._history, self._failed = store, history, failed
-        self._due: Queue[None] = Queue(1)
-        self.trouble = ""
-        """Why the last write has failed; else empty."""
-        threading.Thread(target=self._run, name="weights-store", daemon=True).start()
-
-    @property
-    def idle(self) -> bool:
-        """Whether all that was to be written has been, or has failed."""
-        return not self._due.unfinished_tasks
-
-    def write(self) -> None:
-        """Has the history written, as it is when its turn comes: one write at most waits."""
-        with suppress(Full):
-            self._due.put_nowait(None)
-
-    def _run(self) -> None:
-        while True:
-            self._due.get()
-            try:
-                self._store.keep(self._history.model_copy())
-                self.trouble = ""
-            except InputError as error:
-                self.trouble = str(error)
-                self._failed(self.trouble)
-            self._due.task_done()

@@ -56,16 +56,14 @@ def export(
     """Write racing line, weights and settings for a C program (examples/c_host)."""
     from bayesrace.codegen.host_files import export as write
     from bayesrace.controller.process_settings import ControllerSettings
-    from bayesrace.controller.settings import cycle_values
     from bayesrace.manifest import read_manifest
     from bayesrace.vehicles import get_car
 
-    parameters, process = get_car(car), ControllerSettings()
+    parameters = get_car(car)
     folder, given = _controller(parameters, track, raceline, weights, mpc, artefact)
     manifest = read_manifest(folder)
     manifest.check_car(parameters, folder)
-    cycle = process.fallback, process.compensation, process.stale_s, process.sensor_tolerance
-    values = given["settings"] | cycle_values(parameters, *cycle)
+    values = given["settings"] | ControllerSettings().cycle_values(parameters)
     write(out, manifest, given["rows"], given["spacing_m"], values, given["weights"])
     typer.echo(f"{track or parameters.race_track}, {parameters.name}: {out}")
 
@@ -81,8 +79,7 @@ def _controller(
     """Artefact of a controller, and what it drives by: the line as a table, settings, weights."""
     from bayesrace.codegen.build import build as make
     from bayesrace.codegen.settings import BuildSettings
-    from bayesrace.controller.assembly import read_checked, read_settings
-    from bayesrace.controller.path_table import make_path_table
+    from bayesrace.controller.assembly import make_path_table, read_checked, read_settings
     from bayesrace.controller.settings import MpcSettings
     from bayesrace.manifest import read_manifest
     from bayesrace.raceline import racing_line, read_raceline_for

@@ -94,7 +94,7 @@ def controller(
     die_with_parent(parent_pid)
     from bayesrace.controller.assembly import predictive_controller, read_settings
     from bayesrace.controller.process import main
-    from bayesrace.controller.weights.settings import GateSettings
+    from bayesrace.controller.settings import GateSettings
 
     endpoints = network.endpoints(
         "controller", listen=listen, connect=endpoint, low_latency=low_latency

@@ -16,8 +16,7 @@ import numpy as np
 from rich.console import Console
 
 from bayesrace.cache import cpu_digest
-from bayesrace.controller.assembly import compiled_controller
-from bayesrace.controller.path_table import make_path_table
+from bayesrace.controller.assembly import compiled_controller, make_path_table
 from bayesrace.gp.weights import GpWeights, read_weights
 from bayesrace.learning.dataset import Dataset
 from bayesrace.operation import preparation

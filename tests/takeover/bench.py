@@ -11,10 +11,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from bayesrace.controller.assembly import predictive_controller
-from bayesrace.controller.mpc import PredictiveController
+from bayesrace.controller.assembly import PredictiveController, predictive_controller
+from bayesrace.controller.settings import GateSettings
 from bayesrace.controller.weights.manager import WeightUpdateManager
-from bayesrace.controller.weights.settings import GateSettings
 from bayesrace.gp.weights import GpWeights, encode_weights
 from bayesrace.messages import ROLLBACK, WEIGHTS, Reply, RollbackRequest
 from bayesrace.transport import Endpoints, ask, open_session
@@ -40,8 +39,8 @@ class Bench:
         self.events: list[tuple[str, str]] = []
         """Kind and text."""
         self.manager = WeightUpdateManager(
-            session, CAR, controller.port, gate, user=controller,
-            announce=lambda kind, text, _: self.events.append((kind, text)),
+            session, CAR, controller.port, gate,
+            lambda kind, text, _: self.events.append((kind, text)),
         )  # fmt: skip
         self.adoption = self.manager.adoption
         self._seq = 0
@@ -87,8 +86,10 @@ class Bench:
         return self.manager.status()[name]
 
     def offered(self) -> None:
-        """Weights wait for the control thread."""
-        until(lambda: self.adoption.offers, "an offer")
+        """Weights wait for the control thread, which has copied its samples for their check."""
+        until(lambda: self.adoption.tasks, "a check")
+        self.cycle()
+        until(lambda: self.adoption.tasks, "an offer")
 
     def published(self, kind: str) -> list[str]:
         """Texts of the events of a kind."""

@@ -6,14 +6,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from bayesrace.arrays import Floats
-from bayesrace.controller.assembly import predictive_controller
+from bayesrace.controller.assembly import make_path_table, predictive_controller
 from bayesrace.controller.cycle import Cycle
 from bayesrace.controller.driver import Decision
 from bayesrace.controller.native_step import NativeStep
-from bayesrace.controller.path_table import make_path_table
 from bayesrace.controller.process_settings import ControllerSettings
 from bayesrace.controller.settings import MpcSettings
-from bayesrace.gp.weights import GpWeights, encode_weights
+from bayesrace.gp.weights import GpWeights
 from bayesrace.messages import State
 from bayesrace.vehicles import get_car
 from tests.network.cars import Course
@@ -36,7 +35,7 @@ def replayed(course: Course, states: Sequence[State], weights: Mapping[int, GpWe
 
     def take_over() -> None:
         if len(inputs) in weights:
-            controller.set_weights(encode_weights(weights[len(inputs)]))
+            controller.native.set_weights(weights[len(inputs)])
 
     def send(_: State, decision: Decision) -> None:
         inputs.append((decision.d, decision.delta_rate))

@@ -11,15 +11,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from bayesrace.controller.settings import GateSettings
 from bayesrace.controller.weights.checks import (
     NO_SAMPLES,
     Checks,
     Samples,
     Verdict,
+    compare,
     plausible_features,
+    slack_of,
 )
-from bayesrace.controller.weights.comparison import compare, slack_of
-from bayesrace.controller.weights.settings import GateSettings
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import GpOutput, GpWeights, encode_weights, zero_weights
 from bayesrace.vehicles import CarParameters

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from bayesrace.gp.weights import GpWeights, encode_weights
-from bayesrace.transport import Director, Endpoints, free_endpoint, open_session
+from bayesrace.transport import Director, Endpoints, free_endpoint, open_session, send_rollback
 from tests.network.cars import Course, start_controller, start_plant
 from tests.programs import until
 from tests.takeover.rig import Rig, digest, judges
@@ -64,7 +64,7 @@ def test_accepted_weights_survive_a_restart(
             director.wait_for(("controller",), 20.0)
             status = director.status("controller")
             assert (status.weights_version, status.counters["weights_number"]) == ("two", 2)
-            assert director.rollback("to see").data["version"] == "one"
+            assert send_rollback(session, "orca", "to see").data["version"] == "one"
             assert (
                 director.send_weights(encode_weights(replace(good, version="x"))).data["number"]
                 == 3
@@ -74,6 +74,6 @@ def test_accepted_weights_survive_a_restart(
         with start_controller(*where) as controller:
             director.wait_for(("controller",), 20.0)
             assert director.status("controller").weights_version == "x"
-            assert director.rollback("to see").data["version"] == "one"
-            assert director.rollback("to the start").data["version"] == good.version
+            assert send_rollback(session, "orca", "to see").data["version"] == "one"
+            assert send_rollback(session, "orca", "to the start").data["version"] == good.version
             controller.end()

@@ -9,7 +9,7 @@ import pytest
 
 from bayesrace.controller.weights.store import HISTORY, AcceptedWeights, History, Store, digest_of
 from bayesrace.errors import InputError
-from bayesrace.gp.weights import encode_weights, zero_weights
+from bayesrace.gp.weights import encode_weights, pack_weights, zero_weights
 from bayesrace.vehicles import CarParameters
 
 START = AcceptedWeights(number=0, version="", digest=digest_of(b""), proven=True)
@@ -19,8 +19,8 @@ def history(car: CarParameters, *proven: bool) -> History:
     """Weights that have been accepted one after the other, after those at the start."""
     made = History(discretisation="d", entries=[START])
     for one in proven:
-        data = encode_weights(zero_weights(car.name, "d", f"v{made.next_number}"))
-        made.accept(f"v{made.next_number}", data, one)
+        weights = zero_weights(car.name, "d", f"v{made.next_number}")
+        made.accept(weights.version, encode_weights(weights), pack_weights(weights), one)
     return made
 
 

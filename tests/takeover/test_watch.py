@@ -12,11 +12,10 @@ import numpy as np
 import pytest
 
 from bayesrace.arrays import Floats
+from bayesrace.controller.assembly import make_path_table
 from bayesrace.controller.native_step import NativeStep
-from bayesrace.controller.path_table import make_path_table
-from bayesrace.controller.settings import MpcSettings
+from bayesrace.controller.settings import SAMPLES, WATCHED, GateSettings, MpcSettings
 from bayesrace.controller.weights.adoption import Ruling, Watch
-from bayesrace.controller.weights.settings import SAMPLES, WATCHED, GateSettings
 from bayesrace.gp.weights import GpWeights, pack_weights, zero_weights
 from bayesrace.vehicles import CarParameters
 from tests.conftest import Circuit, fit_weights, smooth_drive

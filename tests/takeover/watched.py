@@ -1,16 +1,16 @@
 """A drive in one process whose weights are checked and watched, as a controller process does it."""
 
 import math
+from types import SimpleNamespace
+from typing import Any
 
 from bayesrace.codegen.build import build
 from bayesrace.codegen.settings import BuildSettings
-from bayesrace.controller.assembly import compiled_controller
+from bayesrace.controller.assembly import PredictiveController, compiled_controller
 from bayesrace.controller.interface import Environment
-from bayesrace.controller.mpc import PredictiveController
-from bayesrace.controller.native_step import NativeStep
-from bayesrace.controller.weights.adoption import Ruling, Watch, limits_at, slowed_down
+from bayesrace.controller.settings import GateSettings
+from bayesrace.controller.weights.adoption import Adoption, Ruling
 from bayesrace.controller.weights.checks import Checks
-from bayesrace.controller.weights.settings import GateSettings
 from bayesrace.gp.weights import GpWeights, encode_weights, pack_weights, zero_weights
 from bayesrace.messages import State
 from bayesrace.operation.closed_loop import ClosedLoop
@@ -24,33 +24,12 @@ __all__ = ["Course"]
 class WatchedLoop(ClosedLoop):
     """A closed loop in which weights are watched: the watch rules between two cycles."""
 
-    def watch(self, step: NativeStep) -> None:
-        """In the next run, over the weights that ``step`` has adopted."""
-        self._step, self._gate = step, GateSettings()
-        self._watch: Watch | None = Watch(self._gate, self._car, step.manifest.step_s)
-        self._slow: Environment | None = None
-        self.found: list[str] = []
-        """What the watch has done, and when."""
+    adoption: Adoption
 
     def _limits(self, state: State) -> Environment | None:
-        if self._watch is not None:
-            self._watch.observe(state.x[3], self._cycle.driver.fallen_back)
-            ruling = self._watch.look(self._step.watch())
-            if ruling is not None:
-                self._rule(ruling, state)
-        return None if self._slow is None else limits_at(state.x[3], self._slow)
-
-    def _rule(self, ruling: Ruling, state: State) -> None:
-        if ruling.action == "proven":
-            self._watch = None
-            return
-        self.found.append(f"{ruling.action} at {len(self._states)}, {state.x[3]:.1f} m/s")
-        if ruling.action == "slow":
-            fastest_mps = float(ruling.data["fastest_mps"])
-            self._slow = slowed_down(self._gate, self._car, fastest_mps)
-        else:
-            self._watch = None
-            self._step.revert_weights()
+        self.adoption.observe(state.x[3], self._cycle.driver.fallen_back)
+        self.adoption.between_cycles(len(self._states))
+        return self.adoption.limits(state.x[3])
 
 
 class Course:
@@ -68,13 +47,20 @@ class Course:
         if not self._checks.judge(encode_weights(weights)).packed:
             return "refused as absurd", -math.inf
         before = proven or zero_weights(weights.car, weights.discretisation)
-        controller, packed = self._controller(before), pack_weights(weights)
-        controller.native.stage_weights(packed)
+        controller = self._controller(before)
+        controller.native.stage_weights(pack_weights(weights))
         controller.native.adopt_weights()
         loop = WatchedLoop(self._car, self._track, self._line, controller)
-        loop.watch(controller.native)
+        history = SimpleNamespace(in_use=SimpleNamespace(proven=False))
+        port: Any = SimpleNamespace(step=controller.native, car=self._car, history=history)
+        loop.adoption = Adoption(port, GateSettings())
         run = loop.drive(0, self._seconds)
-        return "; ".join(loop.found) or "kept", float(run.off_track_m.max())
+        found = [
+            f"{ruling.action} at {cycle}, {run.x[cycle - 1, 3]:.1f} m/s"
+            for cycle, ruling in loop.adoption.done
+            if isinstance(ruling, Ruling) and ruling.action != "proven"
+        ]
+        return "; ".join(found) or "kept", float(run.off_track_m.max())
 
     def _controller(self, weights: GpWeights) -> PredictiveController:
         return compiled_controller(self._artefact, self._car, self._track, self._line, weights)

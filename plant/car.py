@@ -1,4 +1,5 @@
-"""A run of the car without transport or clock: start, laps, end, and the loop of a lockstep run.
+"""The car of one run, without transport or clock: start, sensors, laps, end; and the loop of a
+lockstep run.
 
 The plant process exchanges states for inputs over the network; ``bayesrace.operation.closed_loop``
 does so by a function call. Both drive the car through :func:`drive_lockstep`, so their runs are
