@@ -298,12 +298,26 @@ def ready(
     return step
 
 
+Make = Callable[..., NativeStep]
+
+
 @pytest.fixture
-def native(
+def make(
     kinematic_artefact: Path, car: CarParameters, weights: GpWeights, circuit: Circuit
-) -> NativeStep:
+) -> Make:
+    """Makes a GP controller on the circuit, with other weights and changes of the settings."""
+
+    def made(weights: GpWeights = weights, **changes: float) -> NativeStep:
+        changed = SETTINGS.model_copy(update=changes)
+        return ready(kinematic_artefact, car, weights, circuit, changed)
+
+    return made
+
+
+@pytest.fixture
+def native(make: Make) -> NativeStep:
     """A ready GP controller on the circuit."""
-    return ready(kinematic_artefact, car, weights, circuit, SETTINGS)
+    return make()
 
 
 @pytest.fixture(scope="session")

@@ -1,7 +1,6 @@
 """Caution: the posterior variance, the tube that it makes of a plan, and what the car does then."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import casadi as ca
 import numpy as np
@@ -14,7 +13,7 @@ from bayesrace.codegen.problems.tracking import tracking
 from bayesrace.controller.assembly import compiled_controller
 from bayesrace.controller.native_step import NativeStep, StepStatus
 from bayesrace.controller.settings import MpcSettings
-from bayesrace.gp.weights import KERNELS, GpOutput, GpWeights, read_weights
+from bayesrace.gp.weights import KERNELS, GpWeights, read_weights
 from bayesrace.integrators import PREDICTION
 from bayesrace.learning.validation import predictive_sigma
 from bayesrace.operation.closed_loop import ClosedLoop, built_in_car
@@ -24,30 +23,50 @@ from bayesrace.operation.terminal.terminal import stages_on
 from bayesrace.vehicles import CarParameters, default_car
 from bayesrace.vehicles.models import dynamic, e_kinematic
 from bayesrace.vehicles.tuning import CautionTuning
-from tests.conftest import CAUTIOUS, SETTINGS, Circuit, discrete, fit_weights, ready, smooth_drive
+from tests.conftest import CAUTIOUS, Circuit, Make, discrete, fit_weights, smooth_drive
 
 
-def first_points(output: GpOutput, count: int) -> GpOutput:
-    return replace(output, inputs=output.inputs[:count], alpha=output.alpha[:count])
+def of_points(weights: GpWeights, count: int) -> GpWeights:
+    """The first points of each output."""
+    vx, vy, omega = (
+        replace(one, inputs=one.inputs[:count], alpha=one.alpha[:count]) for one in weights.outputs
+    )
+    return replace(weights, outputs=(vx, vy, omega))
 
 
 @pytest.fixture
 def unsure(weights: GpWeights) -> GpWeights:
     """Of a few points, far from which the posterior knows little."""
-    vx, vy, omega = (first_points(output, 12) for output in weights.outputs)
+    return of_points(weights, 12)
+
+
+def noisy(weights: GpWeights, factor: float) -> GpWeights:
+    """The same mean, with so many times the variance of the noise."""
+    outputs = (replace(one, noise_variance=factor * one.noise_variance) for one in weights.outputs)
+    vx, vy, omega = outputs
     return replace(weights, outputs=(vx, vy, omega))
+
+
+def driven(
+    step: NativeStep, car: CarParameters, x: Floats, u: Floats, count: int
+) -> tuple[Floats, Floats, list[float]]:
+    """State and input after so many steps from these, and the pace of each step."""
+    plant, paces = discrete(dynamic(car)), []
+    for _ in range(count):
+        assert step.step(x, u).usable
+        u = step.u.copy()
+        paces.append(step.info.pace)
+        x = plant(x, u)
+    return x, u, paces
 
 
 @pytest.mark.parametrize("kind", KERNELS)
 @pytest.mark.parametrize("count", [1, 6, 160])
 def test_the_compiled_variance_is_the_posterior_s(
-    kinematic_artefact: Path, car: CarParameters, kind: str, count: int
+    make: Make, car: CarParameters, kind: str, count: int
 ) -> None:
-    full = fit_weights(car, (kind, kind, kind))
-    vx, vy, omega = (first_points(output, count) for output in full.outputs)
-    some = replace(full, outputs=(vx, vy, omega))
-    step = NativeStep(kinematic_artefact, car, CAUTIOUS)
-    step.set_weights(some)
+    some = of_points(fit_weights(car, (kind, kind, kind)), count)
+    step = make(some)
     states, inputs = smooth_drive(car, 30, seed=5)
     states[0, 3:] *= 5  # far from all data
     ours = np.array([step.variance(v) for v in np.column_stack([states, inputs])])
@@ -56,13 +75,10 @@ def test_the_compiled_variance_is_the_posterior_s(
     np.testing.assert_allclose(ours / prior, theirs / prior, rtol=0, atol=1e-9)
 
 
-def test_of_more_points_than_there_is_room_for_some_count(
-    kinematic_artefact: Path, car: CarParameters
-) -> None:
+def test_of_more_points_than_there_is_room_for_some_count(make: Make, car: CarParameters) -> None:
     """The variance is larger than that of all points, and still smaller than the prior's."""
     weights = fit_weights(car, ("rbf", "matern25", "matern15"), count=1024)
-    step = NativeStep(kinematic_artefact, car, CAUTIOUS)
-    step.set_weights(weights)
+    step = make(weights)
     states, inputs = smooth_drive(car, 30, seed=5)
     ours = np.array([step.variance(v) for v in np.column_stack([states, inputs])])
     exact = predictive_sigma(weights, np.column_stack([states[:, 3:], inputs])) ** 2
@@ -108,15 +124,11 @@ def tube_of(step: NativeStep, car: CarParameters, weights: GpWeights, plan: Floa
 
 
 def test_the_tube_adds_correlated_errors_up_along_the_plan(
-    kinematic_artefact: Path, car: CarParameters, unsure: GpWeights, circuit: Circuit
+    make: Make, car: CarParameters, unsure: GpWeights, circuit: Circuit
 ) -> None:
     """Against NumPy: regulator, propagation, and the share of each stage's normal."""
-    step = ready(kinematic_artefact, car, unsure, circuit, CAUTIOUS)
-    plant, x, u = discrete(dynamic(car)), circuit.start(), np.zeros(2)
-    for _ in range(25):
-        assert step.step(x, u).usable
-        u = step.u.copy()
-        x = plant(x, u)
+    step = make(unsure, caution=0.95)
+    x, u, _ = driven(step, car, circuit.start(), np.zeros(2), 25)
     plan_x, plan_u = (part.copy() for part in step.read_plan())
     reference = step.read_reference()
     assert step.solve(x, u, reference, elapsed_s=0.0).usable
@@ -127,25 +139,13 @@ def test_the_tube_adds_correlated_errors_up_along_the_plan(
 
 
 def test_the_car_slows_down_where_it_knows_little_and_speeds_up_again(
-    kinematic_artefact: Path,
-    car: CarParameters,
-    weights: GpWeights,
-    unsure: GpWeights,
-    circuit: Circuit,
+    make: Make, car: CarParameters, weights: GpWeights, circuit: Circuit
 ) -> None:
-    vx, vy, omega = (first_points(output, 2) for output in unsure.outputs)
-    guessing = replace(unsure, outputs=(vx, vy, omega))
-    sure = SETTINGS.model_copy(update={"caution": 0.9999999})
-    step = ready(kinematic_artefact, car, guessing, circuit, sure)
-    plant, x, u, paces = discrete(dynamic(car)), circuit.start(), np.zeros(2), []
-    for k in range(180):
-        if k == 60:
-            step.set_weights(weights)
-            step.set_parameters(car, CAUTIOUS)
-        assert step.step(x, u).usable
-        u = step.u.copy()
-        paces.append(step.info.pace)
-        x = plant(x, u)
+    step = make(of_points(weights, 2), caution=0.9999999)
+    x, u, paces = driven(step, car, circuit.start(), np.zeros(2), 60)
+    step.set_weights(weights)
+    step.set_parameters(car, CAUTIOUS)
+    paces += driven(step, car, x, u, 120)[2]
     tuning = car.tuning.caution
     changes = np.diff(paces) / np.array(paces[:-1]) / PREDICTION.step_s
     assert min(paces[:60]) == tuning.least
@@ -154,32 +154,12 @@ def test_the_car_slows_down_where_it_knows_little_and_speeds_up_again(
     assert changes.max() <= tuning.faster_ps * (1 + 1e-9)
 
 
-def noisy(weights: GpWeights, factor: float) -> GpWeights:
-    """The same mean, with so many times the variance of the noise."""
-    outputs = (replace(one, noise_variance=factor * one.noise_variance) for one in weights.outputs)
-    vx, vy, omega = outputs
-    return replace(weights, outputs=(vx, vy, omega))
-
-
-def driven(
-    step: NativeStep, car: CarParameters, circuit: Circuit, count: int
-) -> tuple[Floats, Floats, list[float]]:
-    """State and input after so many steps from the start, and the pace of each step."""
-    plant, x, u, paces = discrete(dynamic(car)), circuit.start(), np.zeros(2), []
-    for _ in range(count):
-        assert step.step(x, u).usable
-        u = step.u.copy()
-        paces.append(step.info.pace)
-        x = plant(x, u)
-    return x, u, paces
-
-
 def test_the_reference_does_not_leap_when_nothing_is_uncertain_any_more(
-    kinematic_artefact: Path, car: CarParameters, weights: GpWeights, circuit: Circuit
+    make: Make, car: CarParameters, weights: GpWeights, circuit: Circuit
 ) -> None:
     """As after a rollback to no weights."""
-    step = ready(kinematic_artefact, car, noisy(weights, 100), circuit, CAUTIOUS)
-    x, u, paces = driven(step, car, circuit, 40)
+    step = make(noisy(weights, 100), caution=0.95)
+    x, u, paces = driven(step, car, circuit.start(), np.zeros(2), 40)
     assert step.step(np.full(7, np.nan), u) is StepStatus.BAD_STATE
     assert step.info.pace == paces[-1]  # also that of a step that plans nothing
     step.load_weights(b"")
@@ -191,12 +171,11 @@ def test_the_reference_does_not_leap_when_nothing_is_uncertain_any_more(
 
 @pytest.mark.parametrize(("side", "bound"), [(1, 5), (-1, 4)])
 def test_the_plan_keeps_its_uncertainty_away_from_the_edge(
-    kinematic_artefact: Path, car: CarParameters, weights: GpWeights, circuit: Circuit,
-    side: int, bound: int,
-) -> None:  # fmt: skip
+    make: Make, car: CarParameters, circuit: Circuit, side: int, bound: int
+) -> None:
     """Of a track that ends 1 cm beside the line, on either side."""
-    step = ready(kinematic_artefact, car, weights, circuit, CAUTIOUS)
-    x, u, _ = driven(step, car, circuit, 25)
+    step = make(caution=0.95)
+    x, u, _ = driven(step, car, circuit.start(), np.zeros(2), 25)
     line = step.read_reference()
     along = np.sum(line[:, 2:4] * line[:, :2], axis=1)
     line[:, bound] = along + side * 0.01
@@ -214,24 +193,19 @@ def test_the_plan_keeps_its_uncertainty_away_from_the_edge(
 
 
 def test_a_track_that_is_no_constraint_does_not_slow_the_car_down(
-    kinematic_artefact: Path, car: CarParameters, weights: GpWeights, circuit: Circuit
+    make: Make, car: CarParameters, weights: GpWeights, circuit: Circuit
 ) -> None:
-    without = CAUTIOUS.model_copy(update={"constraints": False})
-    step = ready(kinematic_artefact, car, noisy(weights, 100), circuit, without)
-    _, _, paces = driven(step, car, circuit, 40)
+    step = make(noisy(weights, 100), caution=0.95, constraints=False)
+    _, _, paces = driven(step, car, circuit.start(), np.zeros(2), 40)
     assert min(paces) == 1.0
     assert step.info.tube_m == 0.0
 
 
 def test_without_caution_uncertainty_changes_nothing(
-    kinematic_artefact: Path, car: CarParameters, unsure: GpWeights, circuit: Circuit
+    make: Make, car: CarParameters, unsure: GpWeights, circuit: Circuit
 ) -> None:
     """To the bit: the paper's controller, which takes the mean for the truth."""
-    vx, vy, omega = (replace(o, noise_variance=0.5) for o in unsure.outputs)
-    other = replace(unsure, outputs=(vx, vy, omega))
-    steps = [
-        ready(kinematic_artefact, car, one, circuit, SETTINGS) for one in (unsure, other)
-    ]  # fmt: skip
+    steps = [make(one) for one in (unsure, noisy(unsure, 25))]
     x, u = circuit.start(), np.zeros(2)
     for _ in range(10):
         for step in steps:

@@ -105,44 +105,35 @@ def test_a_late_solution_is_driven_where_it_has_got_to(fallback: Make) -> None:
     assert made.decide(good(), 2.0, 0.2, late_s=0.15)[2] == Level.BRAKE
 
 
-def test_one_good_solution_ends_the_shifted_plan_several_end_braking(fallback: Make) -> None:
-    made = fallback(shifted_s=STEP_S, recover_cycles=3)
-    levels = []
-    for cycle, output in enumerate([good(), bad(), good(), bad(), bad(), bad(), good(), good(),
-                                    bad(), good(), good(), good(), good()]):  # fmt: skip
-        levels.append(int(made.decide(output, 2.0, cycle * STEP_S)[2]))
-    #                  good after level 1: at once       after level 2: the third in a row
-    assert levels == [0, 1, 0, 1, 2, 2, 2, 2, 2, 2, 2, 0, 0]
-
-
-def test_a_standing_car_drives_the_first_good_solution(fallback: Make) -> None:
-    """Where only every other one is good, three in a row would never come."""
-    made = fallback(shifted_s=0.1, recover_cycles=3)
-    outputs = [bad(), good(), bad(), good()]
-    levels = [made.decide(one, 0.0, k * STEP_S)[2] for k, one in enumerate(outputs)]
-    assert levels == [Level.STOP, Level.SOLUTION, Level.SHIFTED_PLAN, Level.SOLUTION]
-
-
-def test_a_car_that_has_come_to_stand_does_so_too(fallback: Make) -> None:
-    made = fallback(shifted_s=0.0, recover_cycles=3)
-    outputs = [(bad(), 0.2), (good(), 0.15), (good(), 0.05)]
-    levels = [made.decide(one, vx, k * STEP_S)[2] for k, (one, vx) in enumerate(outputs)]
-    assert levels == [Level.BRAKE, Level.BRAKE, Level.SOLUTION]
-
-
 @pytest.mark.parametrize(
-    "u",
+    ("shifted_s", "good_at", "vx_mps", "expected"),
     [
-        [np.nan, 0.0],
-        [0.0, np.inf],
-        [CAR.d_max + 0.1, 0.0],
-        [0.0, -CAR.delta_rate_max_radps - 0.1],
+        # after level 1 at once, after level 2 with the third in a row
+        (STEP_S, "+-+---++-++++", [2.0] * 13, [0, 1, 0, 1, 2, 2, 2, 2, 2, 2, 2, 0, 0]),
+        # standing, with the first: where only every other one is good, three would never come
+        (0.1, "-+-+", [0.0] * 4, [3, 0, 1, 0]),
+        # a car that has come to stand does so too
+        (0.0, "-++", [0.2, 0.15, 0.05], [2, 2, 0]),
     ],
+    ids=["moving", "standing", "come to stand"],
 )
-def test_a_good_status_does_not_excuse_an_impossible_input(fallback: Make, u: list[float]) -> None:
-    made = fallback()
-    made.decide(good(), 1.0, 0.0)
-    assert made.decide(StepOutput(u=np.array(u)), 1.0, STEP_S)[2] == Level.SHIFTED_PLAN
+def test_how_many_good_solutions_end_a_fallback(
+    fallback: Make, shifted_s: float, good_at: str, vx_mps: list[float], expected: list[int]
+) -> None:
+    made = fallback(shifted_s=shifted_s, recover_cycles=3)
+    levels = [
+        made.decide(good() if sign == "+" else bad(), vx, k * STEP_S)[2]
+        for k, (sign, vx) in enumerate(zip(good_at, vx_mps, strict=True))
+    ]
+    assert levels == expected
+
+
+def test_a_good_status_does_not_excuse_an_impossible_input(fallback: Make) -> None:
+    beyond, rate = CAR.d_max + 0.1, -CAR.delta_rate_max_radps - 0.1
+    for u in ([np.nan, 0.0], [0.0, np.inf], [beyond, 0.0], [0.0, rate]):
+        made = fallback()
+        made.decide(good(), 1.0, 0.0)
+        assert made.decide(StepOutput(u=np.array(u)), 1.0, STEP_S)[2] == Level.SHIFTED_PLAN
 
 
 def test_rounding_beyond_a_limit_is_clipped(fallback: Make) -> None:

@@ -1,8 +1,6 @@
 """Errors that the standard deviations do not cover widen them, so that a car that has changed since
 it was learned is driven with care."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from rich.console import Console
@@ -23,16 +21,15 @@ from bayesrace.operation.preparation import prepare
 from bayesrace.operation.settings import RaceSettings
 from bayesrace.operation.terminal.terminal import stages_on
 from bayesrace.vehicles import CarParameters
-from tests.conftest import CAUTIOUS, Circuit, ready
+from tests.conftest import CAUTIOUS, Circuit, Make
 from tests.cycle_rig import state
 
 STEP_S = PREDICTION.step_s
 
 
 @pytest.fixture
-def step(native: NativeStep, car: CarParameters) -> NativeStep:
-    native.set_parameters(car, CAUTIOUS)
-    return native
+def step(make: Make) -> NativeStep:
+    return make(caution=0.95)
 
 
 def drive(
@@ -79,13 +76,11 @@ def test_a_band_that_covers_the_errors_stays_as_it_is(step: NativeStep, circuit:
     assert set(widening) == {1.0}
 
 
-def test_the_preparation_changes_nothing(
-    kinematic_artefact: Path, car: CarParameters, weights: GpWeights, circuit: Circuit
-) -> None:
+def test_the_preparation_changes_nothing(make: Make, car: CarParameters, circuit: Circuit) -> None:
     """Also if parameters are set between it and the step."""
     ends = []
     for prepared in (False, True):
-        step = ready(kinematic_artefact, car, weights, circuit, CAUTIOUS)
+        step = make(caution=0.95)
         first, _, _ = drive(step, circuit, np.array([0.03, 0.01, 1.0]), 20, prepared)
         step.set_parameters(car, CAUTIOUS.model_copy(update={"caution": 0.9}))
         again, states, inputs = drive(step, circuit, np.zeros(3), 5, prepared)
@@ -120,24 +115,19 @@ def test_the_wider_the_band_the_more_slowly_the_reference_recovers(
     assert rise == pytest.approx(faster / (step.info.widening / 4), rel=1e-6)
 
 
-@pytest.mark.parametrize("duration_s", [0.0, -0.1, 1.5, np.nan])
-def test_a_duration_that_is_none_is_refused(step: NativeStep, duration_s: float) -> None:
-    with pytest.raises(InputError, match="a time"):
-        step.observe(np.zeros(7), np.zeros(2), duration_s, np.zeros(7))
-
-
-def test_numbers_that_are_none_are_refused(step: NativeStep) -> None:
+def test_durations_and_numbers_that_are_none_are_refused(step: NativeStep) -> None:
+    for duration_s in (0.0, -0.1, 1.5, np.nan):
+        with pytest.raises(InputError, match="a time"):
+            step.observe(np.zeros(7), np.zeros(2), duration_s, np.zeros(7))
     with pytest.raises(InputError, match="not finite"):
         step.observe(np.zeros(7), np.zeros(2), STEP_S, np.full(7, np.nan))
 
 
-def test_twice_the_error_in_twice_the_time_counts_twice(
-    kinematic_artefact: Path, car: CarParameters, weights: GpWeights, circuit: Circuit
-) -> None:
+def test_twice_the_error_in_twice_the_time_counts_twice(make: Make, circuit: Circuit) -> None:
     """In the mean over time: the error of each stage is the same."""
     last = []
     for stages in (1, 2):
-        step = ready(kinematic_artefact, car, weights, circuit, CAUTIOUS)
+        step = make(caution=0.95)
         x, u = circuit.start(), np.zeros(2)
         for _ in range(3):
             assert step.step(x, u).usable

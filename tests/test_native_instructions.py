@@ -15,11 +15,9 @@ from bayesrace.integrators import PREDICTION
 from bayesrace.learning.validation import predictive_sigma
 from bayesrace.vehicles import CarParameters
 from bayesrace.vehicles.models import e_kinematic
-from tests.conftest import Problem, fit_weights
+from tests.conftest import Make, Problem, fit_weights
 from tests.test_native_gp import check, points
-from tests.test_native_time import Make, make, solve
-
-__all__ = ["make"]  # the fixture
+from tests.test_native_time import solve
 
 NAMES = ["BASELINE", "AVX2", "AVX512"]
 
@@ -48,6 +46,7 @@ def test_the_best_that_there_is_is_used_at_first(make: Make) -> None:
 def test_model_and_variance_are_those_of_the_oracles(
     kinematic_artefact: Path, car: CarParameters, kind: str, name: str
 ) -> None:
+    """But for the second derivative of Matern 1/2, which the compiled Hessian leaves out."""
     weights = fit_weights(car, (kind, kind, kind), count=131)
     step = using(NativeStep(kinematic_artefact, car, MpcSettings()), name)
     step.set_weights(weights)

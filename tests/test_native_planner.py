@@ -49,10 +49,11 @@ def references(table: PathTable, s: float) -> Floats:
     return np.array(stages)
 
 
-def planner(artefact: Path, car: CarParameters, table: PathTable) -> NativeStep:
+@pytest.fixture
+def step(kinematic_artefact: Path, car: CarParameters, circuit: Circuit) -> NativeStep:
     """A controller of which only the planner is looked at."""
-    step = NativeStep(artefact, car, MpcSettings(iterations=1, iterations_cold=1))
-    step.set_path(table)
+    step = NativeStep(kinematic_artefact, car, MpcSettings(iterations=1, iterations_cold=1))
+    step.set_path(circuit.table)
     return step
 
 
@@ -62,10 +63,8 @@ def place(step: NativeStep, xy: Floats, psi: float = 0.0) -> tuple[float, float,
     return step.info.s_ref_m, step.info.lateral_m, step.read_reference()
 
 
-def test_projection_and_recursion_equal_numpy(
-    kinematic_artefact: Path, car: CarParameters, circuit: Circuit
-) -> None:
-    step, table = planner(kinematic_artefact, car, circuit.table), circuit.table
+def test_projection_and_recursion_equal_numpy(step: NativeStep, circuit: Circuit) -> None:
+    table = circuit.table
     random, s = np.random.default_rng(0), 0.0
     length = len(table.rows) * table.spacing_m
     for _ in range(400):  # several laps, so across the start line too
@@ -113,10 +112,8 @@ def hairpin_table() -> PathTable:
     return PathTable(np.ascontiguousarray(rows), length / len(xy))
 
 
-def test_a_neighbouring_piece_of_the_track_does_not_capture(
-    kinematic_artefact: Path, car: CarParameters
-) -> None:
-    step = planner(kinematic_artefact, car, hairpin_table())
+def test_a_neighbouring_piece_of_the_track_does_not_capture(step: NativeStep) -> None:
+    step.set_path(hairpin_table())
     for k, x in enumerate(np.arange(0.3, 1.6, 0.04)):
         drift = min(0.13, 0.01 * k)  # beyond the middle, nearer to the way back
         s_ref, lateral, _ = place(step, np.array([x, drift]))
@@ -125,10 +122,10 @@ def test_a_neighbouring_piece_of_the_track_does_not_capture(
 
 
 def test_the_first_projection_prefers_the_piece_that_leads_where_the_car_points(
-    kinematic_artefact: Path, car: CarParameters
+    step: NativeStep,
 ) -> None:
     """From nothing, the heading decides between two pieces that are equally near."""
-    step = planner(kinematic_artefact, car, hairpin_table())
+    step.set_path(hairpin_table())
     for offset in (0.07, 0.08, 0.09):
         step.reset()
         assert place(step, np.array([1.0, offset]), 0.0)[0] == pytest.approx(1.0, abs=0.01)
@@ -136,10 +133,8 @@ def test_the_first_projection_prefers_the_piece_that_leads_where_the_car_points(
         assert place(step, np.array([1.0, offset]), np.pi)[0] > 2.0
 
 
-def test_after_a_leap_the_car_is_found_again(
-    kinematic_artefact: Path, car: CarParameters, circuit: Circuit
-) -> None:
-    step, table = planner(kinematic_artefact, car, circuit.table), circuit.table
+def test_after_a_leap_the_car_is_found_again(step: NativeStep, circuit: Circuit) -> None:
+    table = circuit.table
     length = len(table.rows) * table.spacing_m
     place(step, row_at(table, 0.5)[:2], circuit.start(0.5)[2])
     there = circuit.start(length / 2)
@@ -148,10 +143,8 @@ def test_after_a_leap_the_car_is_found_again(
     assert abs(lateral) < 1e-3
 
 
-def test_the_reference_runs_on_across_the_start_line(
-    kinematic_artefact: Path, car: CarParameters, circuit: Circuit
-) -> None:
-    step, table = planner(kinematic_artefact, car, circuit.table), circuit.table
+def test_the_reference_runs_on_across_the_start_line(step: NativeStep, circuit: Circuit) -> None:
+    table = circuit.table
     length = len(table.rows) * table.spacing_m
     for s in (length - 0.2, length - 1e-4, length - 1e-12, 0.0, 1e-9):
         step.reset()
@@ -167,45 +160,39 @@ def test_the_reference_runs_on_across_the_start_line(
 
 
 @pytest.mark.parametrize(
-    "spoil",
-    [
-        "few", "nan", "speed", "fast", "far", "bounds", "normal", "spacing", "spacing nan",
-        "spacing tiny", "many", "repeated",
-    ],
-)  # fmt: skip
-def test_an_unusable_table_is_an_input_error_and_the_old_one_stays(
-    kinematic_artefact: Path, car: CarParameters, circuit: Circuit, spoil: str
+    ("row", "column", "value"),
+    [(-1, 6, np.nan), (3, 2, 0.0), (3, 2, 1e3), (3, 0, 1e200), (3, 5, 10.0), (3, 3, 1.01)],
+    ids=["nan", "standing", "fast", "far", "bounds", "normal"],
+)
+def test_an_unusable_row_is_an_input_error_and_the_old_table_stays(
+    step: NativeStep, circuit: Circuit, row: int, column: int, value: float
 ) -> None:
-    step = planner(kinematic_artefact, car, circuit.table)
-    start = circuit.start(1.0)
-    before = place(step, start[:2], start[2])
-    rows, spacing = circuit.table.rows.copy(), circuit.table.spacing_m
-    if spoil == "few":
-        rows = rows[:7]
-    elif spoil == "many":
-        rows = np.tile(rows, (8192 // len(rows) + 1, 1))
-    elif spoil == "nan":
-        rows[-1, 6] = np.nan
-    elif spoil == "speed":
-        rows[3, 2] = 0.0
-    elif spoil == "fast":
-        rows[3, 2] = 1e3
-    elif spoil == "far":
-        rows[3, 0] = 1e200
-    elif spoil == "bounds":
-        rows[3, 5] = rows[3, 6]
-    elif spoil == "repeated":
-        rows[-1] = rows[0]
-    elif spoil == "normal":
-        rows[3, 3:5] *= 1.01
-    else:
-        spacing = {"spacing": 0.0, "spacing nan": np.nan, "spacing tiny": 1e-300}[spoil]
-    with pytest.raises(InputError, match="path"):
-        step.set_path(PathTable(rows, spacing))
-    step.reset()
-    after = place(step, start[:2], start[2])
-    assert before[:2] == after[:2]
-    np.testing.assert_array_equal(before[2], after[2])
+    rows = circuit.table.rows.copy()
+    rows[row, column] = value
+    refused(step, circuit, rows, circuit.table.spacing_m)
+
+
+def test_so_is_one_of_unusable_length_or_spacing_or_without_a_direction(
+    step: NativeStep, circuit: Circuit
+) -> None:
+    rows, spacing_m = circuit.table.rows, circuit.table.spacing_m
+    closed = np.vstack([rows[:-1], rows[:1]])
+    for bad in (rows[:7], np.tile(rows, (8192 // len(rows) + 1, 1)), closed):
+        refused(step, circuit, bad, spacing_m)
+    for bad_m in (0.0, np.nan, 1e-300):
+        refused(step, circuit, rows, bad_m)
+
+
+def refused(step: NativeStep, circuit: Circuit, rows: Floats, spacing_m: float) -> None:
+    """Tries to set the path; the one before is still in use."""
+    start, seen = circuit.start(1.0), []
+    for _ in range(2):
+        step.reset()
+        s_m, lateral_m, reference = place(step, start[:2], start[2])
+        seen.append((s_m, lateral_m, reference.tobytes()))
+        with pytest.raises(InputError, match="path"):
+            step.set_path(PathTable(rows, spacing_m))
+    assert seen[0] == seen[1]
 
 
 def test_a_racing_line_of_another_track_is_refused(circuit: Circuit) -> None:

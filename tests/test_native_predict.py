@@ -17,7 +17,7 @@ from bayesrace.gp.weights import GpWeights
 from bayesrace.integrators import PERFECT, PREDICTION, Discretisation
 from bayesrace.vehicles import CarParameters
 from bayesrace.vehicles.models import MODELS, Model, dynamic, e_kinematic
-from tests.conftest import SETTINGS, Problem, smooth_drive
+from tests.conftest import SETTINGS, Make, Problem, smooth_drive
 
 TS = 0.02
 NONE = np.zeros(7)
@@ -30,10 +30,8 @@ def nominal(kinematic_artefact: Path, car: CarParameters) -> NativeStep:
 
 
 @pytest.fixture
-def corrected(kinematic_artefact: Path, car: CarParameters, weights: GpWeights) -> NativeStep:
-    step = NativeStep(kinematic_artefact, car, SETTINGS)
-    step.set_weights(weights)
-    return step
+def corrected(make: Make) -> NativeStep:
+    return make()
 
 
 def drives(car: CarParameters, count: int = 40) -> list[tuple[Floats, Floats]]:
@@ -163,12 +161,7 @@ def test_two_predictions_in_a_row_are_one(
             assert np.abs(halves - whole).max() <= share * np.abs(whole - x).max()
 
 
-def test_no_time_changes_nothing(corrected: NativeStep, car: CarParameters) -> None:
-    for x, u in drives(car)[::5]:
-        assert corrected.predict(x, u, 0.0).tobytes() == x.tobytes()
-
-
-def test_the_angle_stops_at_its_limit(corrected: NativeStep, car: CarParameters) -> None:
+def test_angle_and_inputs_stop_at_their_limits(corrected: NativeStep, car: CarParameters) -> None:
     x = np.array([0.0, 0, 0, 1.5, 0, 0, car.delta_max_rad - 0.01])
     for duration_s in (0.005, TS, 0.07):
         after = corrected.predict(x, np.array([0.5, 4.0]), duration_s)
@@ -177,27 +170,20 @@ def test_the_angle_stops_at_its_limit(corrected: NativeStep, car: CarParameters)
     # the rate that leads there is what acts
     limited = corrected.predict(x, np.array([0.5, 0.5]), TS)
     assert corrected.predict(x, np.array([0.5, 4.0]), TS) == pytest.approx(limited, abs=1e-12)
-
-
-def test_inputs_beyond_their_limits_act_as_the_limit(
-    corrected: NativeStep, car: CarParameters
-) -> None:
-    x = np.array([0.0, 0, 0, 1.5, 0, 0, 0])
+    x[6] = 0.0
     beyond = corrected.predict(x, np.array([7.0, -50.0]), 0.03)
     at = corrected.predict(x, np.array([car.d_max, -car.delta_rate_max_radps]), 0.03)
     assert beyond.tobytes() == at.tobytes()
 
 
-@pytest.mark.parametrize("duration_s", [-1e-9, 1.001, np.nan, np.inf])
-def test_an_impossible_duration_is_refused(nominal: NativeStep, duration_s: float) -> None:
-    with pytest.raises(InputError, match="time is negative"):
-        nominal.predict(np.zeros(7), np.zeros(2), duration_s)
-
-
-def test_what_is_not_finite_is_refused(
+def test_impossible_durations_and_what_is_not_finite_are_refused(
     corrected: NativeStep, weights: GpWeights, car: CarParameters
 ) -> None:
     x, u = drives(car)[0]
+    assert corrected.predict(x, u, 0.0).tobytes() == x.tobytes()
+    for duration_s in (-1e-9, 1.001, np.nan, np.inf):
+        with pytest.raises(InputError, match="time is negative"):
+            corrected.predict(x, u, duration_s)
     for i in range(9):
         bad = np.r_[x, u]
         bad[i] = np.nan

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,12 +9,9 @@ import pytest
 from bayesrace.arrays import Floats
 from bayesrace.controller.native_step import NativeStep
 from bayesrace.controller.settings import MpcSettings
-from bayesrace.gp.weights import GpWeights
 from bayesrace.vehicles import CarParameters
-from tests.conftest import SETTINGS, Circuit, Problem
-from tests.test_native_time import TS, Clock, Make, make, residual, solve
-
-__all__ = ["make"]  # the fixture
+from tests.conftest import SETTINGS, Circuit, Make, Problem
+from tests.test_native_time import TS, Clock, residual, solve
 
 DEFAULTS = {name: getattr(MpcSettings(), name) for name in ("early_stop_tol", "iterations")}
 
@@ -123,8 +119,6 @@ def test_what_happens_in_between_is_seen(
     make: Make, recorded: list[Problem], circuit: Circuit, car: CarParameters, between: Between
 ) -> None:
     prepared, plain = make(), make()
-    for one in (prepared, plain):
-        one.set_path(circuit.table)
     for k, p in enumerate(recorded[:24]):
         if k == 12:
             for one in (prepared, plain):
@@ -195,7 +189,6 @@ def test_the_preparation_ends_within_its_budget(
 
 def drive(step: NativeStep, circuit: Circuit, budget_s: float) -> Drive:
     """A lap of a car as the model has it, in which each step is prepared with this budget."""
-    step.set_path(circuit.table)
     x, d, seen = circuit.start(), 0.0, Drive()
     for _ in range(150):
         assert step.step(x, d).usable
@@ -215,7 +208,6 @@ def test_with_a_budget_the_next_problem_is_solved_ahead(make: Make, circuit: Cir
     error = []
     for one in (ahead, plain):
         exact = make(iterations=60, iterations_cold=60, early_stop_tol=0, tolerance=1e-10)
-        exact.set_path(circuit.table)
         solutions = []
         for x, d in one.x:
             exact.step(x, d)
@@ -243,10 +235,7 @@ def test_what_was_solved_ahead_and_does_not_come_does_no_harm(
     np.testing.assert_allclose(ahead.u, plain.u, rtol=0, atol=0.05)
 
 
-def test_without_a_plan_there_is_nothing_to_prepare(
-    make: Make, kinematic_artefact: Path, car: CarParameters, weights: GpWeights,
-    recorded: list[Problem],
-) -> None:  # fmt: skip
+def test_without_a_plan_there_is_nothing_to_prepare(make: Make, recorded: list[Problem]) -> None:
     step, fresh = make(), make()
     step.prepare(TS, 1.0)
     broken = recorded[0].x0.copy()

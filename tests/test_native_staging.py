@@ -15,7 +15,7 @@ from bayesrace.controller.native_step import NativeStep
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import GpWeights, pack_weights
 from bayesrace.vehicles import CarParameters
-from tests.conftest import SETTINGS, Circuit, Problem, fit_weights, mirrored_weights
+from tests.conftest import Make, Problem, fit_weights, mirrored_weights
 from tests.native_programs import OPTIMISED, PROGRAMS, native_program
 
 
@@ -57,41 +57,20 @@ def drive(native: NativeStep, recorded: list[Problem], takeovers: Mapping[int, b
     return np.array(inputs)
 
 
-def fresh(artefact: Path, car: CarParameters, circuit: Circuit, weights: GpWeights) -> NativeStep:
-    step = NativeStep(artefact, car, SETTINGS)
-    step.set_path(circuit.table)
-    step.set_weights(weights)
-    return step
-
-
 def test_taking_over_the_same_weights_changes_no_bit(
-    kinematic_artefact: Path,
-    car: CarParameters,
-    circuit: Circuit,
-    weights: GpWeights,
-    recorded: list[Problem],
+    make: Make, weights: GpWeights, recorded: list[Problem]
 ) -> None:
-    same = pack_weights(weights)
-    calm, busy = (fresh(kinematic_artefact, car, circuit, weights) for _ in range(2))
-    expected = drive(calm, recorded, {})
-    assert drive(busy, recorded, dict.fromkeys(range(0, 100, 7), same)).tobytes() == (
-        expected.tobytes()
-    )
+    busy = drive(make(), recorded, dict.fromkeys(range(0, 100, 7), pack_weights(weights)))
+    assert busy.tobytes() == drive(make(), recorded, {}).tobytes()
 
 
 def test_adopted_weights_are_those_that_were_staged(
-    kinematic_artefact: Path,
-    car: CarParameters,
-    circuit: Circuit,
-    weights: GpWeights,
-    recorded: list[Problem],
+    make: Make, weights: GpWeights, recorded: list[Problem]
 ) -> None:
     """Packed as another process sends them: to the same bits as set directly."""
     other = mirrored_weights(weights)
-    staged, direct = (fresh(kinematic_artefact, car, circuit, weights) for _ in range(2))
-    direct.set_weights(other)
-    inputs = drive(staged, recorded, {0: pack_weights(other)})
-    assert inputs.tobytes() == drive(direct, recorded, {}).tobytes()
+    inputs = drive(make(), recorded, {0: pack_weights(other)})
+    assert inputs.tobytes() == drive(make(other), recorded, {}).tobytes()
 
 
 def test_staging_changes_nothing_before_the_adoption(
@@ -120,21 +99,13 @@ def test_unusable_weights_are_not_staged(native: NativeStep, weights: GpWeights)
 
 
 def test_inputs_jump_only_as_far_as_the_new_model_explains(
-    kinematic_artefact: Path,
-    car: CarParameters,
-    circuit: Circuit,
-    weights: GpWeights,
-    recorded: list[Problem],
+    make: Make, car: CarParameters, recorded: list[Problem]
 ) -> None:
     """The very next input is what a controller would give that had the new weights all along."""
-    thorough = SETTINGS.model_copy(update={"iterations": 20})
     other = fit_weights(car, ("matern25", "matern25", "matern25"), seed=4)
-    old, changed, new = (fresh(kinematic_artefact, car, circuit, weights) for _ in range(3))
-    new.set_weights(other)
-    for step in (old, changed, new):
-        step.set_parameters(car, thorough)
-    before, after = drive(old, recorded, {}), drive(new, recorded, {})
-    inputs = drive(changed, recorded, {50: pack_weights(other)})
+    before = drive(make(iterations=20), recorded, {})
+    after = drive(make(other, iterations=20), recorded, {})
+    inputs = drive(make(iterations=20), recorded, {50: pack_weights(other)})
     assert inputs[:50].tobytes() == before[:50].tobytes()
     assert np.abs(inputs[50:] - after[50:]).max() < 1e-4
     assert np.abs(before[50:] - after[50:]).max() > 1e-2

@@ -10,25 +10,20 @@ from bayesrace.controller.native_step import NativeStep, StepStatus
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import GpWeights
 from bayesrace.vehicles import CarParameters
-from tests.conftest import SETTINGS, Circuit, Problem
+from tests.conftest import SETTINGS, Circuit, Make, Problem
 
 
-@pytest.mark.parametrize("index", range(7))
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e9])
-def test_an_absurd_state_is_bad_state_and_leaves_the_input(
-    native: NativeStep, circuit: Circuit, index: int, value: float
+def test_an_absurd_state_or_duty_cycle_is_bad_state_and_leaves_the_input(
+    native: NativeStep, circuit: Circuit, value: float
 ) -> None:
-    x = circuit.start()
-    x[index] = value
-    native.u[:] = 0.125
-    assert native.step(x, 0.0) is StepStatus.BAD_STATE
-    assert (native.u == 0.125).all()
-    assert native.step(circuit.start(), 0.0).usable
-
-
-def test_an_absurd_duty_cycle_is_bad_state(native: NativeStep, circuit: Circuit) -> None:
-    for value in (np.nan, np.inf, -np.inf, 1e200):
-        assert native.step(circuit.start(), value) is StepStatus.BAD_STATE
+    for index in range(8):
+        numbers = np.r_[circuit.start(), 0.0]
+        numbers[index] = value
+        native.u[:] = 0.125
+        assert native.step(numbers[:7], numbers[7]) is StepStatus.BAD_STATE
+        assert (native.u == 0.125).all()
+        assert native.step(circuit.start(), 0.0).usable
 
 
 def broken_step(native: NativeStep, problem: Problem, how: str) -> StepStatus:
@@ -42,30 +37,19 @@ def broken_step(native: NativeStep, problem: Problem, how: str) -> StepStatus:
 
 @pytest.mark.parametrize(
     ("how", "expected"),
-    [
-        ("steering", StepStatus.INFEASIBLE),
-        ("reference", StepStatus.NOT_FINITE),
-    ],
+    [("steering", StepStatus.INFEASIBLE), ("reference", StepStatus.NOT_FINITE)],
 )
 @pytest.mark.parametrize("warm", [False, True])
 def test_a_failed_step_says_why_keeps_the_input_and_leaves_no_trace(
-    native: NativeStep,
-    kinematic_artefact: Path,
-    car: CarParameters,
-    weights: GpWeights,
-    recorded: list[Problem],
-    how: str,
-    expected: StepStatus,
-    warm: bool,
+    make: Make, recorded: list[Problem], how: str, expected: StepStatus, warm: bool
 ) -> None:
+    native, fresh = make(), make()
     if warm:
         for problem in recorded[:20]:
             native.solve(problem.x0, problem.d_previous, problem.reference)
     native.u[:] = 0.125
     assert broken_step(native, recorded[20], how) is expected
     assert (native.u == 0.125).all()
-    fresh = NativeStep(kinematic_artefact, car, SETTINGS)
-    fresh.set_weights(weights)
     for p in recorded[21:31]:
         status = native.solve(p.x0, p.d_previous, p.reference)
         assert status is fresh.solve(p.x0, p.d_previous, p.reference)
@@ -85,15 +69,8 @@ def test_a_steering_angle_that_the_rate_can_bring_back_is_solved(
         assert side * native.u[1] <= -0.09 / 0.02 + 1e-6
 
 
-def test_a_plan_off_the_dynamics_is_a_defect(
-    kinematic_artefact: Path, car: CarParameters, weights: GpWeights, recorded: list[Problem]
-) -> None:
-    strict = SETTINGS.model_copy(
-        update={"defect_max": 1e-13, "iterations": 1, "iterations_cold": 1}
-    )
-    step = NativeStep(kinematic_artefact, car, strict)
-    step.set_weights(weights)
-    p = recorded[50]
+def test_a_plan_off_the_dynamics_is_a_defect(make: Make, recorded: list[Problem]) -> None:
+    step, p = make(defect_max=1e-13, iterations=1, iterations_cold=1), recorded[50]
     step.u[:] = 0.125
     assert step.solve(p.x0, p.d_previous, p.reference) is StepStatus.DEFECT
     assert step.info.defect > 1e-13
@@ -122,15 +99,10 @@ def test_a_step_without_a_path_and_a_wrong_reference_are_input_errors(
         step.solve(np.zeros(7), 0.0, np.zeros((19, 6)))
 
 
-def test_the_early_stop_ends_the_iterations_early(
-    kinematic_artefact: Path, car: CarParameters, weights: GpWeights, recorded: list[Problem]
-) -> None:
-    used = []
+def test_the_early_stop_ends_the_iterations_early(make: Make, recorded: list[Problem]) -> None:
+    used, p = [], recorded[100]
     for early_stop_tol in (0.0, 1e-5, 1e6):
-        changes = {"early_stop_tol": early_stop_tol, "iterations_cold": 12, "tolerance": 1e-14}
-        step = NativeStep(kinematic_artefact, car, SETTINGS.model_copy(update=changes))
-        step.set_weights(weights)
-        p = recorded[100]
+        step = make(early_stop_tol=early_stop_tol, iterations_cold=12, tolerance=1e-14)
         assert step.solve(p.x0, p.d_previous, p.reference).usable
         used.append(step.info.iterations)
         if 0 < early_stop_tol < 1:

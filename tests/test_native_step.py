@@ -22,17 +22,17 @@ from bayesrace.vehicles import CarParameters, default_car
 from bayesrace.vehicles.models import dynamic, e_kinematic
 from tests.conftest import (
     MIRROR_INPUT,
-    MIRROR_STATE,
     SETTINGS,
     Circuit,
+    Make,
     Problem,
     drive,
     mirrored_line,
     mirrored_weights,
-    ready,
 )
 
-EXACT = SETTINGS.model_copy(update={"iterations": 60, "iterations_cold": 60, "tolerance": 1e-11})
+MANY = {"iterations": 60, "iterations_cold": 60, "tolerance": 1e-11}
+EXACT = SETTINGS.model_copy(update=MANY)
 TIGHT_IPOPT = {
     "tol": 1e-12,
     "constr_viol_tol": 1e-12,
@@ -59,10 +59,8 @@ def solved(step: NativeStep, problem: Problem) -> tuple[StepStatus, Floats, Floa
 
 
 @pytest.fixture
-def exact(kinematic_artefact: Path, car: CarParameters, weights: GpWeights) -> NativeStep:
-    step = NativeStep(kinematic_artefact, car, EXACT)
-    step.set_weights(weights)
-    return step
+def exact(make: Make) -> NativeStep:
+    return make(**MANY)
 
 
 @pytest.fixture(scope="module")
@@ -116,12 +114,8 @@ def test_nearly_every_problem_converges_from_cold(
 def test_the_cost_is_no_worse_than_that_of_ipopt_from_its_own_start(
     exact: NativeStep, corrected: ca.Function, recorded: list[Problem], car: CarParameters
 ) -> None:
-    ocp = OcpNlp(
-        problem_of(E_KINEMATIC),
-        corrected,
-        20,
-        options=TIGHT_IPOPT | {"max_iter": 300},
-    )
+    options = TIGHT_IPOPT | {"max_iter": 300}
+    ocp = OcpNlp(problem_of(E_KINEMATIC), corrected, 20, options=options)
     same = 0
     for problem in recorded[5::15]:
         status, _, u = solved(exact, problem)
@@ -266,109 +260,49 @@ def test_residuals_of_real_time_steps_are_true(
         assert (status is StepStatus.CONVERGED) == converged
 
 
-def test_without_track_constraints_equals_a_very_wide_track(
-    kinematic_artefact: Path, car: CarParameters, weights: GpWeights, recorded: list[Problem]
+@pytest.mark.parametrize(
+    ("settings", "track"),
+    [
+        ({"constraints": False}, (0, 0, 0, 0, -100, 100)),
+        ({"margin_m": 0.03}, (0, 0, 0, 0, 0.03, -0.03)),
+    ],
+    ids=["none is a very wide one", "margin"],
+)
+def test_a_setting_moves_the_tracks_edges(
+    make: Make,
+    exact: NativeStep,
+    recorded: list[Problem],
+    settings: dict[str, float],
+    track: tuple[float, ...],
 ) -> None:
-    wide_step = NativeStep(kinematic_artefact, car, EXACT)
-    free = NativeStep(kinematic_artefact, car, EXACT.model_copy(update={"constraints": False}))
-    for step in (wide_step, free):
-        step.set_weights(weights)
-    for problem in recorded[::40]:
-        wide = problem.reference + np.array([0, 0, 0, 0, -100, 100])
-        _, _, expected = solved(wide_step, replace(problem, reference=wide))
-        _, _, u = solved(free, problem)
+    other = make(**(MANY | settings))
+    for problem in recorded[::50]:
+        moved = replace(problem, reference=problem.reference + np.array(track))
+        _, _, expected = solved(exact, moved)
+        _, _, u = solved(other, problem)
         np.testing.assert_allclose(u, expected, rtol=0, atol=1e-8)
-        assert free.info.slack_max_m == 0
-
-
-def test_the_margin_moves_the_half_planes(
-    kinematic_artefact: Path, car: CarParameters, weights: GpWeights, recorded: list[Problem]
-) -> None:
-    kept = NativeStep(kinematic_artefact, car, EXACT.model_copy(update={"margin_m": 0.03}))
-    plain = NativeStep(kinematic_artefact, car, EXACT)
-    for step in (kept, plain):
-        step.set_weights(weights)
-    for problem in recorded[::60]:
-        narrow = problem.reference + np.array([0, 0, 0, 0, 0.03, -0.03])
-        _, _, expected = solved(plain, replace(problem, reference=narrow))
-        _, _, u = solved(kept, problem)
-        np.testing.assert_allclose(u, expected, rtol=0, atol=1e-8)
+        assert other.info.slack_max_m == 0 or "margin_m" in settings
 
 
 # --- symmetry and determinism ------------------------------------------------------------------
 
 
-def mirrored_problem(problem: Problem) -> Problem:
-    """Left normal and bounds as the mirrored track has them."""
-    x, y, nx, ny, lower, upper = problem.reference.T
-    reference = np.column_stack([x, -y, -nx, ny, -upper, -lower])
-    return Problem(problem.x0 * MIRROR_STATE, problem.d_previous, reference)
-
-
-def test_a_mirrored_problem_gives_mirrored_inputs(
-    exact: NativeStep,
-    kinematic_artefact: Path,
-    car: CarParameters,
-    weights: GpWeights,
-    recorded: list[Problem],
-) -> None:
-    other = NativeStep(kinematic_artefact, car, EXACT)
-    other.set_weights(mirrored_weights(weights))
-    for problem in recorded[7::30]:
-        _, _, u = solved(exact, problem)
-        _, _, mirrored = solved(other, mirrored_problem(problem))
-        np.testing.assert_allclose(mirrored * MIRROR_INPUT, u, rtol=0, atol=1e-8)
-
-
 def test_a_mirrored_track_gives_mirrored_laps(
-    native: NativeStep,
-    kinematic_artefact: Path,
-    car: CarParameters,
-    weights: GpWeights,
-    circuit: Circuit,
+    make: Make, native: NativeStep, weights: GpWeights, circuit: Circuit
 ) -> None:
     track, line = circuit.track.mirrored(), mirrored_line(circuit.line)
     mirror = Circuit(track, line, make_path_table(track, line, default_car().tuning.path.spacing_m))
-    other = NativeStep(kinematic_artefact, car, SETTINGS)
-    other.set_weights(mirrored_weights(weights))
+    other = make(mirrored_weights(weights))
     other.set_path(mirror.table)
     _, inputs = drive(native, circuit, 150)
     _, mirrored = drive(other, mirror, 150)
     np.testing.assert_allclose(mirrored * MIRROR_INPUT, inputs, rtol=0, atol=1e-6)
 
 
-def test_the_same_inputs_give_the_same_bits(
-    native: NativeStep,
-    kinematic_artefact: Path,
-    car: CarParameters,
-    weights: GpWeights,
-    circuit: Circuit,
+def test_another_controller_and_one_that_is_reset_give_the_same_bits(
+    make: Make, native: NativeStep, circuit: Circuit
 ) -> None:
-    other = ready(kinematic_artefact, car, weights, circuit, SETTINGS)
-    first, second = drive(native, circuit, 60)[1], drive(other, circuit, 60)[1]
-    assert first.tobytes() == second.tobytes()
-
-
-def test_reset_forgets_everything(native: NativeStep, circuit: Circuit) -> None:
-    first = drive(native, circuit, 40)[1]
+    first = drive(native, circuit, 60)[1]
     native.reset()
-    again = drive(native, circuit, 40)[1]
-    assert first.tobytes() == again.tobytes()
-
-
-def test_taking_over_identical_weights_changes_nothing(
-    native: NativeStep,
-    kinematic_artefact: Path,
-    car: CarParameters,
-    weights: GpWeights,
-    recorded: list[Problem],
-) -> None:
-    other = NativeStep(kinematic_artefact, car, SETTINGS)
-    other.set_weights(weights)
-    for k, p in enumerate(recorded[:60]):
-        if k % 7 == 3:
-            other.set_weights(weights)
-        assert native.solve(p.x0, p.d_previous, p.reference) is other.solve(
-            p.x0, p.d_previous, p.reference
-        )
-        assert native.u.tobytes() == other.u.tobytes()
+    for again in (make(), native):
+        assert drive(again, circuit, 60)[1].tobytes() == first.tobytes()

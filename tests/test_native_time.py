@@ -1,7 +1,5 @@
 """The compiled step and time: the plan keeps in step with it, and a budget is used and kept."""
 
-from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -9,25 +7,9 @@ import pytest
 
 from bayesrace.controller.native_step import NativeStep, StepStatus
 from bayesrace.errors import InputError
-from bayesrace.gp.weights import GpWeights
-from bayesrace.vehicles import CarParameters
-from tests.conftest import SETTINGS, Circuit, Problem
-
-Make = Callable[..., NativeStep]
+from tests.conftest import SETTINGS, Circuit, Make, Problem
 
 TS = 0.02
-
-
-@pytest.fixture
-def make(kinematic_artefact: Path, car: CarParameters, weights: GpWeights) -> Make:
-    """A controller with the given changes of the settings."""
-
-    def made(**changes: float) -> NativeStep:
-        step = NativeStep(kinematic_artefact, car, SETTINGS.model_copy(update=changes))
-        step.set_weights(weights)
-        return step
-
-    return made
 
 
 def solve(step: NativeStep, p: Problem, **times: float) -> StepStatus:
@@ -216,23 +198,19 @@ def test_the_first_iteration_is_always_done(make: Make, recorded: list[Problem])
     assert (hasty.info.iterations, hasty.info.time_limited) == (1, 1)
 
 
-@pytest.mark.parametrize("budget_s", [0.0, -1.0, np.nan])
-def test_no_budget_means_the_iteration_limits(
-    make: Make, recorded: list[Problem], budget_s: float
+@pytest.mark.parametrize(
+    ("budget_s", "clock"), [(0.0, True), (-1.0, True), (np.nan, True), (1.0, False)]
+)
+def test_no_budget_or_clock_means_the_iteration_limits(
+    make: Make, recorded: list[Problem], budget_s: float, clock: bool
 ) -> None:
     step, plain = make(iterations=3, early_stop_tol=1e-4), make(iterations=3, early_stop_tol=1e-4)
     Clock(step, 1e3)
+    if not clock:
+        null = step.artefact.ffi.NULL
+        step._check(step._library.br_mpc_set_clock(step.handle, null, null), "clock")
     for p in recorded[:30]:
         assert solve(step, p, budget_s=budget_s) is solve(plain, p)
-        assert step.u.tobytes() == plain.u.tobytes()
-
-
-def test_without_a_clock_there_is_no_budget(make: Make, recorded: list[Problem]) -> None:
-    step, plain = make(), make()
-    null = step.artefact.ffi.NULL
-    step._check(step._library.br_mpc_set_clock(step.handle, null, null), "clock")
-    for p in recorded[:20]:
-        assert solve(step, p, budget_s=1.0) is solve(plain, p)
         assert step.u.tobytes() == plain.u.tobytes()
 
 

@@ -26,6 +26,18 @@ def standing(
     return x
 
 
+def rig_at(native: NativeStep, circuit: Circuit, pose: Floats) -> Rig:
+    """A car that begins in this state."""
+    rig = Rig(native, circuit)
+    rig.x = pose
+    return rig
+
+
+def drive(rig: Rig, cycles: int) -> None:
+    for _ in range(cycles):
+        rig.cycle()
+
+
 def where(rig: Rig) -> float:
     """Arc length of the car's place on the line."""
     output = rig.driver.output
@@ -37,21 +49,13 @@ def test_a_car_drives_off_from_any_pose(native: NativeStep, circuit: Circuit) ->
     """Without turning round on purpose, an eighth of such poses end in standing for ever."""
     random = np.random.default_rng(3)
     for _ in range(12):
-        rig = Rig(native, circuit)
+        bounds = np.array([(0, 6.3), (-0.4, 0.4), (-math.pi, math.pi), (-0.35, 0.35)]).T
         native.reset()
-        rig.x = standing(
-            circuit,
-            random.uniform(0, 6.3),
-            random.uniform(-0.4, 0.4),
-            random.uniform(-math.pi, math.pi),
-            random.uniform(-0.35, 0.35),
-        )
+        rig = rig_at(native, circuit, standing(circuit, *random.uniform(*bounds)))
         pose = rig.x.round(3).tolist()
-        for _ in range(150):
-            rig.cycle()
+        drive(rig, 150)
         where_m = where(rig)
-        for _ in range(50):
-            rig.cycle()
+        drive(rig, 50)
         ahead = (where(rig) - where_m) % circuit.line.length_m
         assert 0.5 < ahead < circuit.line.length_m / 2, f"{ahead} m in a second from {pose}"
 
@@ -62,7 +66,6 @@ def test_it_turns_to_the_side_with_more_room(
     native: NativeStep, circuit: Circuit, to_left_m: float, turned_rad: float
 ) -> None:
     """Pointing the other way, its right is the line's left."""
-    native.reset()
     x = standing(circuit, 1.0, 0.0, turned_rad)
     on_track = circuit.track.project_points(x[:2])
     right, left = circuit.track.widths(on_track.s_m[0])
@@ -78,11 +81,8 @@ def test_a_car_that_points_a_little_aside_does_not_turn_first(
 ) -> None:
     """At the pace of a turn the standing lap of ETHZMobil, whose line begins so, took 0.66 s
     longer."""
-    rig = Rig(native, circuit)
-    native.reset()
-    rig.x = standing(circuit, 1.0, 0.0, turned_rad)
-    for _ in range(15):
-        rig.cycle()
+    rig = rig_at(native, circuit, standing(circuit, 1.0, 0.0, turned_rad))
+    drive(rig, 15)
     assert rig.x[3] > 0.8
 
 
@@ -95,11 +95,8 @@ def test_a_start_in_a_tight_bend_is_no_turn(native: NativeStep) -> None:
     line = offset_line(track, offset_m=0.0, lateral_mps2=3.0, v_max=2.0)
     ring = Circuit(track, line, make_path_table(track, line, default_car().tuning.path.spacing_m))
     native.set_path(ring.table)
-    rig = Rig(native, ring)
-    native.reset()
-    rig.x = ring.start(1.0, 0.0)
-    for _ in range(25):
-        rig.cycle()
+    rig = rig_at(native, ring, ring.start(1.0, 0.0))
+    drive(rig, 25)
     assert rig.x[3] > 0.8
 
 
@@ -114,17 +111,14 @@ def fastest_in_turn(rig: Rig, cycles: int) -> float:
 
 
 def test_a_speed_limit_is_kept_in_a_turn(native: NativeStep, circuit: Circuit) -> None:
-    rig = Rig(native, circuit)
-    native.reset()
+    rig = rig_at(native, circuit, standing(circuit, 1.0, 0.0, math.pi))
     rig.environment = Environment(speed_limit_mps=0.3)
-    rig.x = standing(circuit, 1.0, 0.0, math.pi)
     assert 0.1 < fastest_in_turn(rig, 300) < 0.3
 
 
 def test_where_it_is_to_stop_a_car_that_points_away_keeps_its_plan(
     native: NativeStep, circuit: Circuit
 ) -> None:
-    native.reset()
     stop = Environment(speed_limit_mps=0.0)
     x = standing(circuit, 1.0, 0.0, math.pi)
     native.step(x, 0.0, environment=stop)
@@ -136,7 +130,6 @@ def test_where_it_is_to_stop_a_car_that_points_away_keeps_its_plan(
 
 @pytest.mark.parametrize("turned_rad", [-1.5, 1.5])
 def test_it_turns_the_shorter_way(native: NativeStep, circuit: Circuit, turned_rad: float) -> None:
-    native.reset()
     assert native.step(standing(circuit, 1.0, 0.0, turned_rad), 0.0).usable
     assert np.sign(native.u[1]) == -np.sign(turned_rad)
 
@@ -144,25 +137,18 @@ def test_it_turns_the_shorter_way(native: NativeStep, circuit: Circuit, turned_r
 def test_the_pace_is_kept_and_the_turn_ends_when_the_line_is_faced(
     native: NativeStep, circuit: Circuit
 ) -> None:
-    rig = Rig(native, circuit)
-    native.reset()
-    rig.x = standing(circuit, 1.0, 0.0, math.pi)
+    rig = rig_at(native, circuit, standing(circuit, 1.0, 0.0, math.pi))
     assert fastest_in_turn(rig, 200) < 0.7
-    for _ in range(100):
-        rig.cycle()
+    drive(rig, 100)
     assert rig.x[3] > 1.0
 
 
 def test_a_stop_on_command_ends_a_turn(native: NativeStep, circuit: Circuit) -> None:
-    rig = Rig(native, circuit)
-    native.reset()
-    rig.x = standing(circuit, 1.0, 0.0, math.pi)
-    for _ in range(20):
-        rig.cycle()
+    rig = rig_at(native, circuit, standing(circuit, 1.0, 0.0, math.pi))
+    drive(rig, 20)
     assert rig.x[3] > 0.2
     rig.driver.stop()
-    for _ in range(100):
-        rig.cycle()
+    drive(rig, 100)
     assert abs(rig.x[3]) < 0.05
 
 
