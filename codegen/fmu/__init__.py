@@ -5,8 +5,8 @@ In the order of their use: :mod:`.car` and :mod:`.controller` say what the FMU i
 files in ``native`` and compiles it; :func:`pack` makes the file with its XML (:mod:`.archive`), and
 :func:`exchange_weights` one with other weights.
 
-In ``native``, ``fmu.h`` says what the C of a model implements; ``fmu.c`` and ``fmi2.c`` or
-``fmi3.c`` are the same for every model.
+In ``native``, ``fmu.h`` says what the C of a model implements; ``fmi.c`` and ``fmi2.c`` or
+``fmi3.c``, which call it, are the same for every model.
 """
 
 from bayesrace.codegen.fmu.archive import exchange_weights, pack

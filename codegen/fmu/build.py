@@ -93,7 +93,8 @@ def sources_of(definition: FmuDefinition) -> tuple[str, dict[str, bytes]]:
 
     The token stands for everything that is compiled or read at run time.
     """
-    layer = [NATIVE / name for name in ("fmu.c", "fmu.h", f"fmi{definition.version}.c")]
+    names = ("fmu.h", "fmi.h", "fmi.c", f"fmi{definition.version}.c")
+    layer = [NATIVE / name for name in names]
     files = {path.name: path.read_bytes() for path in (*layer, *fmi_headers(definition.version))}
     files = {**definition.sources, **files}
     files["exports.map"] = b"{ global: fmi2*; fmi3*; local: *; };\n"

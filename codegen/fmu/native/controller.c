@@ -74,6 +74,9 @@ static br_mpc_error use_parameters(controller *c, const double *v) {
 /* Uses what has been set since the step before. Each parameter is within its bounds; those that do
  * not fit together are given up: step and FMU go on with the parameters of the step before. */
 static FMI(Status) take_parameters(fmu_instance *instance) {
+#define ROLE(name, kind, role, ...) FMU_##role,
+    static const fmu_role roles[] = {FMU_VARIABLES(ROLE)};
+#undef ROLE
     controller *c = instance->model;
     double *v = instance->value;
     const br_mpc_error error = use_parameters(c, v);
@@ -83,7 +86,7 @@ static FMI(Status) take_parameters(fmu_instance *instance) {
     }
     use_parameters(c, c->used);
     for (int i = 0; i < FMU_VALUES; i++)
-        if (fmu_variables[i].role == FMU_TUNABLE) v[i] = c->used[i];
+        if (roles[i] == FMU_TUNABLE) v[i] = c->used[i];
     return fmu_note(instance, FMI(Warning), UNUSABLE "; the parameters before stay in use",
                     br_mpc_error_text(error));
 }

@@ -3,13 +3,13 @@
 #include <stdlib.h>
 #include <string.h>
 
-#include "fmu.h"
+#include "fmi.h"
 
 const char *fmi2GetTypesPlatform(void) { return fmi2TypesPlatform; }
 
 /* Some importers take the text for a printf format, others print it as it is. */
-void fmu_report(const fmu_instance *instance, fmi2Status status, const char *category,
-                const char *text) {
+static void report(const fmu_instance *instance, fmi2Status status, const char *category,
+                   const char *text) {
     char escaped[1024];
     size_t n = 0;
     for (; *text && n < sizeof escaped - 2; text++) {
@@ -26,7 +26,7 @@ void fmu_report(const fmu_instance *instance, fmi2Status status, const char *cat
 
 /* Turns the URI file:///a%20b, file:/a%20b or file://host/a of FMI into a plain path, in place;
  * a plain path, which many importers pass, stays. NULL for nothing or another scheme. */
-char *fmu_folder(char *location) {
+static char *plain_path(char *location) {
     const size_t n = strcspn(location, ":/\\");
     const bool has_scheme = location[n] == ':' && n > 1; /* a single letter is a drive */
     if (location[0] && !has_scheme) return location;
@@ -50,9 +50,13 @@ char *fmu_folder(char *location) {
 fmi2Component fmi2Instantiate(fmi2String name, fmi2Type type, fmi2String guid, fmi2String location,
                               const fmi2CallbackFunctions *functions, fmi2Boolean visible,
                               fmi2Boolean logging) {
-    if (!functions || type != fmi2CoSimulation) return NULL;
-    return fmu_new(name, guid, location, (void (*)(void))functions->logger,
-                   functions->componentEnvironment);
+    char *copy = malloc(location ? strlen(location) + 1 : 1);
+    fmu_instance *instance = NULL;
+    if (copy && functions && type == fmi2CoSimulation)
+        instance = fmu_new(name, guid, plain_path(strcpy(copy, location ? location : "")), report,
+                           (void (*)(void))functions->logger, functions->componentEnvironment);
+    free(copy);
+    return instance;
 }
 
 fmi2Status fmi2SetupExperiment(fmi2Component c, fmi2Boolean has_tolerance, fmi2Real tolerance,

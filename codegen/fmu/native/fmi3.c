@@ -2,15 +2,13 @@
  * An importer may load every function, so those of what these FMUs lack exist as well. */
 #include <math.h>
 
-#include "fmu.h"
+#include "fmi.h"
 
-void fmu_report(const fmu_instance *instance, fmi3Status status, const char *category,
-                const char *text) {
+static void report(const fmu_instance *instance, fmi3Status status, const char *category,
+                   const char *text) {
     if (instance->logger)
         ((fmi3LogMessageCallback)instance->logger)(instance->environment, status, category, text);
 }
-
-char *fmu_folder(char *location) { return location[0] ? location : NULL; }
 
 static void no(fmi3Boolean *answer) {
     if (answer) *answer = fmi3False;
@@ -22,7 +20,8 @@ static void no(fmi3Boolean *answer) {
     fmi3Instance fmi3Instantiate##kind(fmi3String name, fmi3String token, fmi3String resources, \
                                        fmi3Boolean visible, fmi3Boolean logging, __VA_ARGS__) { \
         const char *refused = reason;                                                           \
-        if (!refused) return fmu_new(name, token, resources, (void (*)(void))log, environment); \
+        if (!refused)                                                                           \
+            return fmu_new(name, token, resources, report, (void (*)(void))log, environment);   \
         if (log) log(environment, fmi3Error, "logStatusError", refused);                        \
         return NULL;                                                                            \
     }

@@ -1,9 +1,9 @@
-/* What the files of an FMU share: the instance, the model's functions, the FMI layer's.
+/* What a model and the FMI layer share: the instance, its variables, the model's functions.
  *
- * A model (car.c, controller.c) is a few functions over one array of values. The layer, which owns
- * the instance, does everything else that FMI demands: phases, arguments, messages, saved states.
- * It is compiled for one version, FMU_FMI; FMI(Name) is fmi2Name or fmi3Name: functions that are
- * alike in both are written once, in fmu.c; fmi2.c or fmi3.c has the others.
+ * A model (car.c, controller.c) is a few functions over one array of values. The layer (fmi.h),
+ * which owns the instance, calls them, and does everything else that FMI demands: phases,
+ * arguments, saved states. An FMU is compiled for one version, FMU_FMI; FMI(Name) is fmi2Name or
+ * fmi3Name.
  *
  * A refused call has changed nothing and has sent one message, with the status that it returns:
  * Discard for a value outside the bounds of its variable, after which the simulation may go on;
@@ -12,9 +12,11 @@
 #ifndef FMU_H
 #define FMU_H
 
+#include <stdarg.h>
 #include <stdbool.h>
 #include <stddef.h>
 #include <stdint.h>
+#include <stdio.h>
 
 #include "fmu_config.h" /* generated: FMU_VALUES, FMU_STATES, FMU_V_<name> of each value */
 
@@ -49,8 +51,13 @@ typedef enum {
 } fmu_phase;
 
 typedef struct fmu_saved fmu_saved;
+typedef struct fmu_instance fmu_instance;
 
-typedef struct {
+/* Passes a message to the importer's logger; category: "logStatusError" ... */
+typedef void fmu_report(const fmu_instance *instance, FMI(Status) status, const char *category,
+                        const char *text);
+
+struct fmu_instance {
     double value[FMU_VALUES]; /* by value reference; integers and booleans as doubles; the last is
                                  FMU_V_time [s] */
     double stop_time;         /* infinite where none was given */
@@ -62,17 +69,35 @@ typedef struct {
     char *name;
     void *block;          /* what was allocated */
     fmu_saved *saved;     /* states that this instance has made and that still live */
+    fmu_report *report;   /* of the version */
     void (*logger)(void); /* the importer's, to be cast to FMI's type */
     void *environment;    /* the importer's */
-} fmu_instance;
+};
 
 /* Sends a message (printf format) with the status that the call is about to return, to the
  * importer's log. Returns the status. */
-__attribute__((format(printf, 3, 4))) FMI(Status)
-    fmu_note(const fmu_instance *instance, FMI(Status) status, const char *format, ...);
+__attribute__((format(printf, 3, 4))) static inline FMI(Status)
+    fmu_note(const fmu_instance *instance, FMI(Status) status, const char *format, ...) {
+    static const char *const categories[] = {"logStatusOK", "logStatusWarning", "logStatusDiscard",
+                                             "logStatusError"};
+    char text[512];
+    va_list arguments;
+    va_start(arguments, format);
+    vsnprintf(text, sizeof text, format, arguments);
+    va_end(arguments);
+    instance->report(instance, status, categories[status], text);
+    return status;
+}
 
 #define FMU_ERROR(instance, ...) fmu_note(instance, FMI(Error), __VA_ARGS__)
 #define fmu_refuse(...) (FMU_ERROR(__VA_ARGS__) == FMI(OK)) /* false, after the message */
+
+typedef enum {
+    FMU_CALCULATED, /* never set from outside */
+    FMU_FIXED,      /* set until the end of initialisation; states of Model Exchange also later */
+    FMU_TUNABLE,    /* set at any time */
+    FMU_INPUT       /* set at any time, to any value */
+} fmu_role;
 
 /* ---- the model; what is bool is false after fmu_refuse, else true ---- */
 
@@ -96,62 +121,5 @@ void fmu_model_derivatives(const fmu_instance *instance, double *dx);
 /* Model Exchange: out = J in, both [FMU_VALUES], with the Jacobian J of all values by all values.
  * Only the rows of states (one for itself) and of their derivatives count. */
 void fmu_model_directional(const fmu_instance *instance, const double *in, double *out);
-
-/* ---- the layer ---- */
-
-typedef enum { FMU_REAL, FMU_INTEGER, FMU_BOOLEAN } fmu_kind;
-
-typedef enum {
-    FMU_CALCULATED, /* never set from outside */
-    FMU_FIXED,      /* set until the end of initialisation; states of Model Exchange also later */
-    FMU_TUNABLE,    /* set at any time */
-    FMU_INPUT       /* set at any time, to any value */
-} fmu_role;
-
-typedef struct {
-    const char *name;
-    fmu_kind kind;
-    fmu_role role;
-    double start, min, max;
-    bool open; /* min and max themselves are excluded */
-    double nominal;
-} fmu_variable;
-
-extern const fmu_variable fmu_variables[FMU_VALUES];
-
-/* States of Model Exchange come first, their derivatives last but for the time. */
-#define FMU_FIRST_DERIVATIVE (FMU_VALUES - 1 - FMU_STATES)
-#define FMU_IS_STATE(reference) ((int)(reference) < FMU_STATES)
-#define FMU_IS_DERIVATIVE(reference) \
-    ((int)(reference) >= FMU_FIRST_DERIVATIVE && (reference) != FMU_V_time)
-
-/* Passes a message to the importer, in the version's own way; category: "logStatusError" ... */
-void fmu_report(const fmu_instance *instance, FMI(Status) status, const char *category,
-                const char *text);
-
-/* The path of the resources folder from what the importer passes, in place; NULL for none. */
-char *fmu_folder(char *location);
-
-/* NULL after a message if the token is another FMU's, or the model refuses. */
-fmu_instance *fmu_new(const char *name, const char *token, const char *resources,
-                      void (*logger)(void), void *environment);
-
-/* Whether the instance, which may be NULL, is in one of the phases; else a message. */
-bool fmu_in_phase(const fmu_instance *instance, unsigned phases, const char *function);
-
-/* Ends an FMI function of `void *c` with an error unless that is an instance in such a phase. */
-#define REQUIRE(phases)         \
-    fmu_instance *instance = c; \
-    if (!fmu_in_phase(instance, phases, __func__)) return FMI(Error)
-#define ANY_PHASE (~0u)
-
-/* Answers a function that these FMUs do not have: with an error unless it concerns no variable. */
-FMI(Status) fmu_absent(const fmu_instance *instance, size_t variables, const char *function);
-
-bool fmu_set_times(fmu_instance *instance, double start, bool has_stop, double stop);
-FMI(Status) fmu_step(fmu_instance *instance, double time, double h); /* Co-Simulation */
-
-/* Model Exchange: computes the derivatives' values; Discard if they are not finite. */
-FMI(Status) fmu_derivatives(fmu_instance *instance);
 
 #endif

@@ -1,10 +1,8 @@
 /* What is alike in both versions of FMI: instances, their phases and messages, steps of
  * Co-Simulation; access to variables; saved states. */
-#include "fmu.h"
+#include "fmi.h"
 
 #include <math.h>
-#include <stdarg.h>
-#include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
 
@@ -15,20 +13,6 @@
 const fmu_variable fmu_variables[FMU_VALUES] = {FMU_VARIABLES(ROW)};
 
 const char *FMI(GetVersion)(void) { return FMI(Version); }
-
-/* ---- messages ---- */
-
-FMI(Status) fmu_note(const fmu_instance *instance, FMI(Status) status, const char *format, ...) {
-    static const char *const categories[] = {"logStatusOK", "logStatusWarning", "logStatusDiscard",
-                                             "logStatusError"};
-    char text[512];
-    va_list arguments;
-    va_start(arguments, format);
-    vsnprintf(text, sizeof text, format, arguments);
-    va_end(arguments);
-    fmu_report(instance, status, categories[status], text);
-    return status;
-}
 
 FMI(Status) fmu_absent(const fmu_instance *instance, size_t variables, const char *function) {
     if (!instance) return FMI(Error);
@@ -52,7 +36,7 @@ static bool create(fmu_instance *instance) {
 }
 
 fmu_instance *fmu_new(const char *name, const char *token, const char *resources,
-                      void (*logger)(void), void *environment) {
+                      fmu_report *report, void (*logger)(void), void *environment) {
     if (!name || !name[0]) name = FMU_IDENTIFIER;
     if (!resources) resources = "";
     const size_t own = ALIGNED(sizeof(fmu_instance)), model = ALIGNED(fmu_model_size());
@@ -63,7 +47,8 @@ fmu_instance *fmu_new(const char *name, const char *token, const char *resources
     instance->block = block;
     instance->model = (char *)instance + own;
     instance->name = strcpy((char *)instance + own + model, name);
-    instance->resources = fmu_folder(strcpy(instance->name + letters, resources));
+    instance->resources = resources[0] ? strcpy(instance->name + letters, resources) : NULL;
+    instance->report = report;
     instance->logger = logger;
     instance->environment = environment;
     char *path = instance->resources;
