@@ -6,7 +6,6 @@ import subprocess
 import zipfile
 from enum import IntEnum
 from functools import cache
-from multiprocessing.context import SpawnProcess
 from pathlib import Path
 from typing import Final
 
@@ -96,13 +95,13 @@ def faulty_host(path: Path, outputs: tuple[str, ...] = STATES) -> FmuHost:
     )
 
 
-def process_of(host: FmuHost) -> SpawnProcess:
+def process_of(host: FmuHost) -> subprocess.Popen[bytes]:
     """The process that the FMU runs in."""
     assert host._process is not None
     return host._process
 
 
-def folder_of(process: SpawnProcess) -> Path:
+def folder_of(process: subprocess.Popen[bytes]) -> Path:
     """The unpacked FMU of such a process."""
     return Path(f"/proc/{process.pid}/cwd").readlink()
 

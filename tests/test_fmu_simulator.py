@@ -84,7 +84,7 @@ def test_after_a_fault_the_last_sample_stands(host: FmuHost) -> None:
     car.step((0.5, 1.0))
     before, applied = car.x.copy(), car.u_applied
     process_of(host).kill()
-    process_of(host).join()
+    process_of(host).wait()
     with pytest.raises(FmuFault, match="SIGKILL"):
         car.step_switched([(5, None), (15, (0.1, 0.0))])
     np.testing.assert_array_equal(car.x, before)

@@ -12,24 +12,25 @@ import signal
 import socket
 import sys
 import threading
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, suppress
-from multiprocessing import get_context
-from multiprocessing.connection import Connection
-from multiprocessing.context import SpawnProcess
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack, suppress
 from pathlib import Path
-from typing import Annotated, Any, Final
+from subprocess import PIPE, STDOUT, Popen, TimeoutExpired
+from typing import IO, Annotated, Any, Final, cast
 
 from msgspec import Meta, MsgspecError, msgpack
 
 from bayesrace.errors import InputError
 from bayesrace.files import temporary_folder
+from bayesrace.interpreter import RUN_MODULE
 from bayesrace.plant.fmu.inspection import extract, library
 from bayesrace.plant.fmu.wiring import Value
-from bayesrace.plant.fmu.worker import LONGEST, serve
+from bayesrace.plant.fmu.worker import LONGEST
 from bayesrace.plant.vehicle import FmuFault
 
 __all__ = ["FmuHost"]
+
+_WORKER: Final = "bayesrace.plant.fmu.worker"
 
 _GOODBYE_S: Final = 0.5
 """For the FMU to free what it holds, when it is not needed any more."""
@@ -41,26 +42,10 @@ _KEPT: Final = 4096
 _TROUBLE: Final = re.compile(r"^\[FMU (?!info)\w+\] (.+)", re.MULTILINE)
 
 
-@contextmanager
-def _safe_path() -> Iterator[None]:
-    """A Python that starts meanwhile does not import from the current folder.
-
-    Else a file there that is named as a module of ours or of the standard library replaces it.
-    """
-    before = os.environ.get("PYTHONSAFEPATH")
-    os.environ["PYTHONSAFEPATH"] = before or "1"
-    try:
-        yield
-    finally:
-        del os.environ["PYTHONSAFEPATH"]
-        if before is not None:
-            os.environ["PYTHONSAFEPATH"] = before
-
-
 class _Output(threading.Thread):
     """Passes an FMU's standard output and error, and its log, on within bounds; keeps the end."""
 
-    def __init__(self, pipe: Connection) -> None:
+    def __init__(self, pipe: IO[bytes]) -> None:
         super().__init__(daemon=True)
         self._pipe = pipe
         self.restart()
@@ -119,7 +104,7 @@ class FmuHost:
         one_each = Meta(min_length=len(outputs), max_length=len(outputs))
         self._decoder = msgpack.Decoder(Annotated[list[float], one_each] | str)
         self._cpus = sorted(os.sched_getaffinity(0))
-        self._process: SpawnProcess | None = None
+        self._process: Popen[bytes] | None = None
         self._used = False
         try:
             self._launch()
@@ -132,7 +117,7 @@ class FmuHost:
         Raises FmuFault if the FMU fails.
         """
         once = self._fmu.coSimulation.canBeInstantiatedOnlyOncePerProcess
-        if self._process and (not self._process.is_alive() or (once and self._used)):
+        if self._process and (self._process.poll() is not None or (once and self._used)):
             self.close()
         if not self._process:
             self._launch()
@@ -158,7 +143,7 @@ class FmuHost:
         if self._process:
             with suppress(OSError):
                 self._plant.send(msgpack.encode(None))
-            self._process.join(_GOODBYE_S)
+            self._wait(self._process, _GOODBYE_S)
             self._kill()
 
     def fault(self, what: str, when: str = "") -> FmuFault:
@@ -170,29 +155,32 @@ class FmuHost:
         return FmuFault(f"FMU {self.path.name} {at}: {what}{last}")
 
     def _launch(self) -> None:
-        spawn, self._used = get_context("spawn"), False
+        self._used = False
         try:
-            with ExitStack() as ours, ExitStack() as theirs:
+            with ExitStack() as ours:
                 folder = ours.enter_context(temporary_folder())
                 extract(self.path, folder)
                 binary = library(self.path, folder, self._fmu)
                 # The kernel keeps messages apart: what the FMU writes there is one of its own.
                 self._plant, worker = socket.socketpair(type=socket.SOCK_SEQPACKET)
                 ours.enter_context(self._plant)
-                theirs.enter_context(worker)
-                reading, writing = spawn.Pipe(duplex=False)
-                theirs.enter_context(writing)
-                names = tuple(self._inputs), tuple(self._outputs)
-                arguments = (worker, writing, self._cpus, str(folder), str(binary), *names)
-                self._output = _Output(reading)
-                process = spawn.Process(target=serve, args=arguments, daemon=True)
-                with _safe_path():
-                    process.start()
-                self._process, self._held = process, ours.pop_all()
+                with worker:
+                    # Ctrl-C at the terminal is for the plant, which ends the run in order. What an
+                    # FMU writes beside itself is removed with it.
+                    process = Popen(
+                        (*RUN_MODULE, _WORKER, str(worker.fileno()), str(binary)), cwd=folder,
+                        stdin=PIPE, stdout=PIPE, stderr=STDOUT, pass_fds=(worker.fileno(),),
+                        start_new_session=True,
+                    )  # fmt: skip
+                # Its end tells the worker of the plant's.
+                ours.enter_context(cast("IO[bytes]", process.stdin))
+                self._output = _Output(cast("IO[bytes]", process.stdout))
+                self._process = process
+                self._held = ours.pop_all()
         except (OSError, RuntimeError) as error:  # no memory, processes, descriptors or disk left
             why = getattr(error, "strerror", None) or error
             raise FmuFault(f"FMU {self.path.name}: its process does not start: {why}") from None
-        self._ask(None, "while it was loaded")
+        self._ask((self._cpus, self._inputs, self._outputs), "while it was loaded")
 
     def _ask(self, question: object, when: str = "") -> list[float]:
         """The outputs that the worker answers, all finite; ``when``: at the start.
@@ -209,15 +197,14 @@ class FmuHost:
                 raise self.fault(f"gave {name} = {value:g}", when)
         return answer
 
-    def _answer(self, process: SpawnProcess, question: object, limit: str) -> list[float] | str:
+    def _answer(self, process: Popen[bytes], question: object, limit: str) -> list[float] | str:
         """Outputs, or what has failed; ``limit``: of the time, as the map calls it."""
         message, limit_s = msgpack.encode(question), getattr(self, limit)
         if len(message) > LONGEST:
             return "too many values at once: set fewer in the map, or a longer step_s"
         try:
             self._plant.settimeout(limit_s)
-            if question is not None:
-                self._plant.send(message)
+            self._plant.send(message)
             if answer := self._plant.recv(LONGEST):
                 outputs: list[float] | str = self._decoder.decode(answer)
                 return outputs
@@ -225,21 +212,26 @@ class FmuHost:
             return "wrote to its process's connection with the plant"
         except OSError as error:
             # What a process that has ended has started may hold its connection open.
-            if isinstance(error, TimeoutError) and process.is_alive():
+            if isinstance(error, TimeoutError) and process.poll() is None:
                 return f"did not answer within {limit_s:g} s ({limit} in the map's [fmu])"
-        process.join(1.0)
-        code = process.exitcode
+        code = self._wait(process, 1.0)
         if code is None:
             return "closed its connection to the plant"
         names = {-one: f"crashed ({one.name})" for one in signal.Signals}
         return names.get(code, f"ended its own process with exit code {code}")
 
+    @staticmethod
+    def _wait(process: Popen[bytes], seconds: float) -> int | None:
+        """Its exit code; None if it lives on."""
+        with suppress(TimeoutExpired):
+            process.wait(seconds)
+        return process.returncode
+
     def _kill(self) -> None:
         """End the process now, with what it has started, and remove the unpacked FMU."""
         process, self._process = self._process, None
-        if process and process.pid:
-            with suppress(ProcessLookupError, PermissionError):  # it may not lead a session yet
+        if process:
+            with suppress(ProcessLookupError):
                 os.killpg(process.pid, signal.SIGKILL)
-            process.kill()
-            process.join()
+            process.wait()
             self._held.close()

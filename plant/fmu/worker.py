@@ -1,19 +1,22 @@
 """The process that an FMU runs in: whatever the FMU does to its process, it does to this one.
 
-:class:`bayesrace.plant.fmu.host.FmuHost` starts it by :func:`serve`. A question is a mapping of
-start values, or what :meth:`_Instance.step` takes; the answer is the outputs, or a text that says
-what failed. Loading is answered without a question, its outputs are zero.
+:class:`bayesrace.plant.fmu.host.FmuHost` runs this module in the FMU's folder, with its own end of
+standard input, which closes when the plant ends. The first question says on which processors to run
+and which inputs and outputs count. The others are a mapping of start values, or what
+:meth:`_Instance.step` takes. The answer is the outputs (zeros before a start), or a text that says
+what failed.
 """
 
 import os
 import shutil
 import signal
 import socket
+import sys
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
-from multiprocessing import connection, parent_process
+from pathlib import Path
 from typing import Any, Final
 
 from fmpy import read_model_description
@@ -22,7 +25,7 @@ from fmpy.fmi2 import fmi2Discard, fmi2Terminated
 from fmpy.simulation import apply_start_values, instantiate_fmu
 from msgspec import msgpack
 
-__all__ = ["LONGEST", "serve"]
+__all__ = ["LONGEST"]
 
 LONGEST: Final = 1 << 16
 """Bytes of a question or an answer; the longest carry start values."""
@@ -32,28 +35,18 @@ _LONGEST_MESSAGE: Final = 1000
 """Characters of the FMU's log."""
 
 
-def serve(
-    plant: socket.socket, output: Any, cpus: Sequence[int], folder: str, *arguments: Any
-) -> None:
-    """Loads the FMU in ``folder`` and answers the plant until it sends None.
-
-    ``output``: the pipe that becomes standard output and error; ``arguments``: those of the
-    instance after the folder.
-    """
-    os.environ.pop("PYTHONSAFEPATH", None)  # the host's; not for what the FMU starts
-    os.setsid()  # Ctrl-C at the terminal is for the plant, which ends the run in order
-    for descriptor in (1, 2):
-        os.dup2(output.fileno(), descriptor)
-    output.close()
+def _serve(plant: socket.socket, library: str) -> None:
+    """Loads the FMU that lies in the current folder and answers the plant until it sends None."""
+    folder = str(Path.cwd())
     plant.set_inheritable(False)  # not for what the FMU starts
     watch = threading.Thread(target=_end_with_the_plant, args=(folder,), daemon=True)
     watch.start()
-    # An FMU that hangs must not keep the plant off a CPU.
-    os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
-    os.sched_setaffinity(0, cpus)
-    os.chdir(folder)  # what an FMU writes beside itself is removed with it
     try:
-        instance = _Instance(folder, *arguments)
+        cpus, inputs, outputs = msgpack.decode(plant.recv(LONGEST))
+        # An FMU that hangs must not keep the plant off a CPU.
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+        os.sched_setaffinity(0, cpus)
+        instance = _Instance(folder, library, inputs, outputs)
         while True:
             plant.send(msgpack.encode(instance.values()))
             match msgpack.decode(plant.recv(LONGEST)):
@@ -78,8 +71,9 @@ def _words(error: Exception) -> str:
 
 def _end_with_the_plant(folder: str) -> None:
     """At the plant's death: end, also while the FMU computes, and what it has started."""
-    plant = parent_process()
-    connection.wait([plant.sentinel] if plant else [])
+    with suppress(OSError):  # the FMU may have closed it
+        while os.read(0, 1):
+            pass
     shutil.rmtree(folder, ignore_errors=True)
     os.killpg(0, signal.SIGKILL)
 
@@ -184,3 +178,7 @@ class _Instance:
             if self._initialised:  # before, FMI allows no end but to free it
                 fmu.terminate()
         (fmu.fmi2FreeInstance if self._two else fmu.fmi3FreeInstance)(fmu.component)
+
+
+if __name__ == "__main__":
+    _serve(socket.socket(fileno=int(sys.argv[1])), sys.argv[2])
