@@ -19,7 +19,6 @@ from bayesrace.vehicles.parts import GRAVITY_MPS2, Drive, LinearTyres, Part, Tyr
 from bayesrace.vehicles.tuning import (
     REFERENCE_ACCELERATION_MPS2,
     REFERENCE_WHEELBASE_M,
-    SPEED,
     Scales,
     Tuning,
     scaled,
@@ -80,7 +79,7 @@ class CarParameters(Part):
         "turns left as it turns right and whose whole state is measured [-]",
     )
     brake_fade_mps: float = Field(
-        default_factory=lambda known: scaled(_BRAKE_FADE_MPS, SPEED, _scales(known)),
+        default_factory=lambda known: scaled(_BRAKE_FADE_MPS, "m/s", _scales(known)),
         gt=0,
         description="below this speed braking fades linearly to none, so that a car stops and "
         "stays: brakes do not drive a car back [m/s]",

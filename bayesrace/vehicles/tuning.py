@@ -5,15 +5,14 @@ wheelbase L and usable acceleration a = friction g it is scaled by dimensional a
 
     value = reference (L / L0)^p (a / a0)^q c^r
 
-with (p, q) = (1, 0) for lengths, (1/2, 1/2) for speeds, (1/2, -1/2) for times, (0, 1) for
-accelerations, (-1/2, 1/2) for yaw rates. r counts the drive commands in the number's unit; c is 1
-for a duty cycle, as the reference car has it, and a in m/s^2 for a car whose command is an
-acceleration: full throttle of the reference car is about its usable acceleration. A new car needs
-none of them in its file.
+with the exponents that its unit has: (p, q) = (1, 0) for lengths, (1/2, 1/2) for speeds,
+(1/2, -1/2) for times. r counts the drive commands in the unit; c is 1 for a duty cycle, as the
+reference car has it, and a in m/s^2 for a car whose command is an acceleration: full throttle of
+the reference car is about its usable acceleration. A new car needs none of them in its file.
 """
 
 from collections.abc import Sequence
-from typing import Any, Final, NamedTuple, Self
+from typing import Any, Final, NamedTuple
 
 from pydantic import Field
 
@@ -22,39 +21,19 @@ from bayesrace.vehicles.parts import GRAVITY_MPS2, Part
 __all__ = [
     "REFERENCE_ACCELERATION_MPS2",
     "REFERENCE_WHEELBASE_M",
-    "BrakingTuning",
     "CautionTuning",
-    "DrivingTuning",
-    "GateTuning",
-    "MonitorTuning",
-    "ObjectiveTuning",
-    "PathTuning",
-    "PlausibleTuning",
-    "ProgressTuning",
     "PursuitTuning",
     "RacelineTuning",
     "Scales",
-    "ScaleTuning",
     "Tuning",
-    "TurnTuning",
     "scaled",
 ]
 
 REFERENCE_WHEELBASE_M: Final = 0.029 + 0.033
 REFERENCE_ACCELERATION_MPS2: Final = 0.75 * GRAVITY_MPS2
 
-Dimension = tuple[float, float, float]
-"""Exponents of wheelbase, acceleration and command."""
-
-LENGTH: Final = (1.0, 0.0, 0.0)
-SPEED: Final = (0.5, 0.5, 0.0)
-TIME: Final = (0.5, -0.5, 0.0)
-ACCELERATION: Final = (0.0, 1.0, 0.0)
-YAW_RATE: Final = (-0.5, 0.5, 0.0)
-YAW_ACCELERATION: Final = (-1.0, 1.0, 0.0)
-COMMAND_PER_SPEED: Final = (-0.5, -0.5, 1.0)
-COMMAND: Final = (0.0, 0.0, 1.0)
-NONE: Final = (0.0, 0.0, 0.0)
+_BASE_UNITS: Final = {"m": (1.0, 0.0, 0.0), "s": (0.5, -0.5, 0.0), "command": (0.0, 0.0, 1.0)}
+"""Exponents of wheelbase, acceleration and command; all other units are plain numbers."""
 
 
 class Scales(NamedTuple):
@@ -67,18 +46,27 @@ class Scales(NamedTuple):
     """Drive command."""
 
 
-def scaled(reference: float, dimension: Dimension, scales: Scales) -> float:
-    """The reference car's number for a car of these scales; exactly the same for ones."""
+def scaled(reference: float, unit: str, scales: Scales) -> float:
+    """The reference car's number for a car of these scales; exactly the same for ones.
+
+    ``unit``: base units with exponents, such as ``rad s^2/m``.
+    """
+    exponents = [0.0, 0.0, 0.0]
+    above, _, below = unit.partition("/")
+    for factors, sign in ((above, 1), (below, -1)):
+        for name, _, power in (factor.partition("^") for factor in factors.split()):
+            for i, exponent in enumerate(_BASE_UNITS.get(name, ())):
+                exponents[i] += sign * int(power or 1) * exponent
     value = reference
-    for scale, exponent in zip(scales, dimension, strict=True):
+    for scale, exponent in zip(scales, exponents, strict=True):
         value *= scale**exponent
     return float(value)
 
 
-def _number(reference: float, dimension: Dimension, text: str, **bounds: float) -> Any:
+def _number(reference: float, text: str, **bounds: float) -> Any:
+    """A field; ``text`` ends with its unit in brackets."""
     limits: dict[str, Any] = {**bounds} or {"gt": 0}
-    extra: dict[str, Any] = {"reference": reference, "dimension": list(dimension)}
-    return Field(description=text, json_schema_extra=extra, **limits)
+    return Field(description=text, json_schema_extra={"reference": reference}, **limits)
 
 
 class _Section(Part):
@@ -88,92 +76,82 @@ class _Section(Part):
         values: dict[str, Any] = {}
         for name, field in cls.model_fields.items():
             extra: Any = field.json_schema_extra
-            if extra:
-                values[name] = scaled(extra["reference"], tuple(extra["dimension"]), scales)
+            unit = str(field.description).rpartition("[")[2].removesuffix("]")
+            values[name] = scaled(extra["reference"], unit, scales)
         return values
 
 
 class RacelineTuning(_Section):
     """How the racing line is optimised and sampled."""
 
-    step_m: float = _number(0.03, LENGTH, "length of an optimisation interval [m]")
-    spacing_m: float = _number(0.01, LENGTH, "distance of the line's points [m]")
-    smoothing_m: float = _number(
-        0.03, LENGTH, "Gaussian smoothing of the frame, not of the track [m]"
-    )
+    step_m: float = _number(0.03, "length of an optimisation interval [m]")
+    spacing_m: float = _number(0.01, "distance of the line's points [m]")
+    smoothing_m: float = _number(0.03, "Gaussian smoothing of the frame, not of the track [m]")
     rate_weight: float = _number(
-        1e-6,
-        (1.5, -2.5, 0.0),
-        "cost of the squared slope of acceleration over the way, against chatter [s^5/m]",
+        1e-6, "cost of the squared slope of acceleration over the way, against chatter [s^5/m]"
     )
     curvature_weight: float = _number(
-        1e-6, (3.5, -0.5, 0.0), "cost of the squared slope of curvature over the way [s m^3]"
+        1e-6, "cost of the squared slope of curvature over the way [s m^3]"
     )
-    tolerance_m: float = _number(
-        5e-4, LENGTH, "by which the line may pass the margin between stations [m]"
-    )
-    room_m: float = _number(0.005, LENGTH, "least width that the margins must leave [m]")
-    speed_min_mps: float = _number(0.2, SPEED, "least speed of a flying lap [m/s]")
-    speed_bound_mps: float = _number(30.0, SPEED, "bound above any top speed [m/s]")
-    acceleration_bound_mps2: float = _number(
-        50.0, ACCELERATION, "bound above any acceleration [m/s^2]"
-    )
+    tolerance_m: float = _number(5e-4, "by which the line may pass the margin between stations [m]")
+    room_m: float = _number(0.005, "least width that the margins must leave [m]")
+    speed_min_mps: float = _number(0.2, "least speed of a flying lap [m/s]")
+    speed_bound_mps: float = _number(30.0, "bound above any top speed [m/s]")
+    acceleration_bound_mps2: float = _number(50.0, "bound above any acceleration [m/s^2]")
 
 
 class PathTuning(_Section):
     """The table of racing line and track that the planner reads, and its search."""
 
     spacing_m: float = _number(
-        0.005, LENGTH, "wanted distance of rows; the planner interpolates linearly [m]"
+        0.005, "wanted distance of rows; the planner interpolates linearly [m]"
     )
-    spacing_min_m: float = _number(1e-4, LENGTH, "least distance of rows [m]")
+    spacing_min_m: float = _number(1e-4, "least distance of rows [m]")
     spacing_max_m: float = _number(
-        0.1, LENGTH, "largest distance of rows: the search window must hold several [m]"
+        0.1, "largest distance of rows: the search window must hold several [m]"
     )
-    window_back_m: float = _number(0.3, LENGTH, "search window behind the last projection [m]")
-    window_ahead_m: float = _number(0.5, LENGTH, "search window ahead of it [m]")
-    far_m: float = _number(1e4, LENGTH, "largest coordinate of a row [m]")
-    speed_max_mps: float = _number(100.0, SPEED, "largest speed of a row [m/s]")
+    window_back_m: float = _number(0.3, "search window behind the last projection [m]")
+    window_ahead_m: float = _number(0.5, "search window ahead of it [m]")
+    far_m: float = _number(1e4, "largest coordinate of a row [m]")
+    speed_max_mps: float = _number(100.0, "largest speed of a row [m/s]")
 
 
 class TurnTuning(_Section):
     """Turning round, for a slow car that points away from its line."""
 
-    slow_mps: float = _number(0.2, SPEED, "a turn begins below this speed [m/s]")
-    away_rad: float = _number(1.0, NONE, "and if the line is farther than this to one side [rad]")
-    faced_rad: float = _number(0.3, NONE, "a turn ends within this angle [rad]")
-    ahead_m: float = _number(0.5, LENGTH, "point of the line that the car turns to, ahead [m]")
+    slow_mps: float = _number(0.2, "a turn begins below this speed [m/s]")
+    away_rad: float = _number(1.0, "and if the line is farther than this to one side [rad]")
+    faced_rad: float = _number(0.3, "a turn ends within this angle [rad]")
+    ahead_m: float = _number(0.5, "point of the line that the car turns to, ahead [m]")
     tangent_m: float = _number(
-        0.05, LENGTH, "length of line that its direction beside the car is taken from [m]"
+        0.05, "length of line that its direction beside the car is taken from [m]"
     )
-    behind_rad: float = _number(
-        2.0, NONE, "with the point farther behind, either side serves [rad]"
-    )
-    wider_m: float = _number(2.0, LENGTH, "added to the track on either side, on the way [m]")
-    pace_mps: float = _number(0.5, SPEED, "speed of a turn [m/s]")
-    stop_mps: float = _number(0.05, SPEED, "a speed limit below this is a stop [m/s]")
-    too_fast_mps: float = _number(1.0, SPEED, "a faster car is not turning round [m/s]")
-    throttle_spm: float = _number(
-        2.0, COMMAND_PER_SPEED, "drive command per speed below the pace [command s/m]"
-    )
+    behind_rad: float = _number(2.0, "with the point farther behind, either side serves [rad]")
+    wider_m: float = _number(2.0, "added to the track on either side, on the way [m]")
+    pace_mps: float = _number(0.5, "speed of a turn [m/s]")
+    stop_mps: float = _number(0.05, "a speed limit below this is a stop [m/s]")
+    too_fast_mps: float = _number(1.0, "a faster car is not turning round [m/s]")
+    throttle_spm: float = _number(2.0, "drive command per speed below the pace [command s/m]")
 
 
 class BrakingTuning(_Section):
     """Steering along the line while braking to standstill, when something has failed."""
 
-    lookahead_m: float = _number(0.16, LENGTH, "distance of the target at standstill [m]")
-    lookahead_s: float = _number(0.05, TIME, "distance added per speed [s]")
-    preview_s: float = _number(0.04, TIME, "how far ahead the line's curvature is taken [s]")
+    lookahead_m: float = _number(0.16, "distance of the target at standstill [m]")
+    lookahead_s: float = _number(0.05, "distance added per speed [s]")
+    preview_s: float = _number(0.04, "how far ahead the line's curvature is taken [s]")
     understeer_s2pm: float = _number(
-        0.008, (0.0, -1.0, 0.0), "steering angle added per acceleration in a bend [rad s^2/m]"
+        0.008, "steering angle added per acceleration in a bend [rad s^2/m]"
     )
-    damping_s: float = _number(0.02, TIME, "steering angle per excess of the yaw rate [s]")
-    slow_mps: float = _number(0.4, SPEED, "slower, slip angles are those at this speed [m/s]")
-    chord_m: float = _number(0.08, LENGTH, "chord that the line's direction is taken from [m]")
+    damping_s: float = _number(0.02, "steering angle per excess of the yaw rate [s]")
+    slow_mps: float = _number(0.4, "slower, slip angles are those at this speed [m/s]")
+    chord_m: float = _number(0.08, "chord that the line's direction is taken from [m]")
     centre: float = _number(
-        0.5, NONE, "share of the way from the line to the middle of the track, at standstill [-]",
-        ge=0, le=1,
-    )  # fmt: skip
+        0.5,
+        "share of the way from the line to the middle of the track, at standstill [-]",
+        ge=0,
+        le=1,
+    )
 
 
 class MonitorTuning(_Section):
@@ -184,22 +162,20 @@ class MonitorTuning(_Section):
     """
 
     position_m: float = _number(
-        0.022, LENGTH, "between the position and the way that the velocities make [m]"
+        0.022, "between the position and the way that the velocities make [m]"
     )
     heading_rad: float = _number(
-        0.12, NONE, "between the heading and the angle that the yaw rate makes [rad]"
+        0.12, "between the heading and the angle that the yaw rate makes [rad]"
     )
     steering_rad: float = _number(
-        0.012, NONE, "between the steering angle and what the steering rate makes of it [rad]"
+        0.012, "between the steering angle and what the steering rate makes of it [rad]"
     )
-    memory_s: float = _number(0.2, TIME, "over which these ways are reckoned [s]")
-    speed_mps: float = _number(0.5, SPEED, "change of the velocity without acceleration [m/s]")
-    acceleration_mps2: float = _number(12.0, ACCELERATION, "largest acceleration [m/s^2]")
-    yaw_rate_radps: float = _number(2.5, YAW_RATE, "change of the yaw rate at once [rad/s]")
-    yaw_acceleration_radps2: float = _number(
-        250.0, YAW_ACCELERATION, "largest yaw acceleration [rad/s^2]"
-    )
-    drift: float = _number(0.06, NONE, "error of the prediction of a braking car, per distance [-]")
+    memory_s: float = _number(0.2, "over which these ways are reckoned [s]")
+    speed_mps: float = _number(0.5, "change of the velocity without acceleration [m/s]")
+    acceleration_mps2: float = _number(12.0, "largest acceleration [m/s^2]")
+    yaw_rate_radps: float = _number(2.5, "change of the yaw rate at once [rad/s]")
+    yaw_acceleration_radps2: float = _number(250.0, "largest yaw acceleration [rad/s^2]")
+    drift: float = _number(0.06, "error of the prediction of a braking car, per distance [-]")
 
     def tolerance_for(self, deviations: Sequence[float]) -> float:
         """The multiple of these bounds that sensors take whose noise has such standard deviations,
@@ -218,34 +194,32 @@ class MonitorTuning(_Section):
 class PlausibleTuning(_Section):
     """Largest magnitudes of a state that a controller accepts."""
 
-    position_m: float = _number(1e4, LENGTH, "coordinates [m]")
-    heading_rad: float = _number(1e7, NONE, "heading, not wrapped [rad]")
-    speed_mps: float = _number(100.0, SPEED, "velocities [m/s]")
-    yaw_rate_radps: float = _number(1e3, YAW_RATE, "yaw rate [rad/s]")
-    steering_rad: float = _number(1.5, NONE, "steering angle [rad]")
+    position_m: float = _number(1e4, "coordinates [m]")
+    heading_rad: float = _number(1e7, "heading, not wrapped [rad]")
+    speed_mps: float = _number(100.0, "velocities [m/s]")
+    yaw_rate_radps: float = _number(1e3, "yaw rate [rad/s]")
+    steering_rad: float = _number(1.5, "steering angle [rad]")
 
 
 class ScaleTuning(_Section):
     """Sizes of the states, by which the OCP's dynamics defects are measured."""
 
-    position_m: float = _number(1.0, LENGTH, "coordinates [m]")
-    heading_rad: float = _number(1.0, NONE, "heading [rad]")
-    speed_mps: float = _number(1.0, SPEED, "velocities [m/s]")
-    yaw_rate_radps: float = _number(10.0, YAW_RATE, "yaw rate [rad/s]")
-    steering_rad: float = _number(1.0, NONE, "steering angle [rad]")
+    position_m: float = _number(1.0, "coordinates [m]")
+    heading_rad: float = _number(1.0, "heading [rad]")
+    speed_mps: float = _number(1.0, "velocities [m/s]")
+    yaw_rate_radps: float = _number(10.0, "yaw rate [rad/s]")
+    steering_rad: float = _number(1.0, "steering angle [rad]")
 
 
 class ObjectiveTuning(_Section):
     """Weights, margin and stages of the OCP, where its settings state none."""
 
-    q_position: float = _number(1.0, (-2.0, 0.0, 0.0), "Q: squared position error [1/m^2]")
-    r_duty: float = _number(
-        0.002, (0.0, 0.0, -2.0), "R: squared change of the drive command [1/command^2]"
-    )
-    r_delta_rate: float = _number(3e-5, (1.0, -1.0, 0.0), "R: squared steering rate [s^2/rad^2]")
-    s_slack: float = _number(100.0, (-2.0, 0.0, 0.0), "S: squared track violation [1/m^2]")
-    margin_m: float = _number(0.01, LENGTH, "distance kept from the track edges [m]")
-    horizon: int = _number(20, NONE, "stages that the OCP looks ahead [-]", ge=2, le=100)
+    q_position: float = _number(1.0, "Q: squared position error [1/m^2]")
+    r_duty: float = _number(0.002, "R: squared change of the drive command [1/command^2]")
+    r_delta_rate: float = _number(3e-5, "R: squared steering rate [s^2/rad^2]")
+    s_slack: float = _number(100.0, "S: squared track violation [1/m^2]")
+    margin_m: float = _number(0.01, "distance kept from the track edges [m]")
+    horizon: int = _number(20, "stages that the OCP looks ahead [-]", ge=2, le=100)
 
 
 _COMPILED: Final = frozenset(
@@ -257,28 +231,24 @@ _COMPILED: Final = frozenset(
 class ProgressTuning(_Section):
     """The same for the OCP that maximises progress."""
 
-    q_contour: float = _number(0.1, (-2.0, 0.0, 0.0), "squared distance to the line [1/m^2]")
-    gain: float = _number(
-        2.5, (-0.5, 0.5, 0.0), "reward of the time that the line takes for the progress [1/s]"
-    )
-    r_duty: float = _number(
-        2e-4, (0.0, 0.0, -2.0), "R: squared change of the drive command [1/command^2]"
-    )
-    r_delta_rate: float = _number(1e-6, (1.0, -1.0, 0.0), "R: squared steering rate [s^2/rad^2]")
+    q_contour: float = _number(0.1, "squared distance to the line [1/m^2]")
+    gain: float = _number(2.5, "reward of the time that the line takes for the progress [1/s]")
+    r_duty: float = _number(2e-4, "R: squared change of the drive command [1/command^2]")
+    r_delta_rate: float = _number(1e-6, "R: squared steering rate [s^2/rad^2]")
     proximal_duty: float = _number(
-        0.02, (0.0, 0.0, -2.0), "of a drive command's change in one QP [1/command^2]", ge=0
+        0.02, "of a drive command's change in one QP [1/command^2]", ge=0
     )
     proximal_delta_rate: float = _number(
-        1e-3, (1.0, -1.0, 0.0), "of a steering rate's change in one QP [s^2/rad^2]", ge=0
+        1e-3, "of a steering rate's change in one QP [s^2/rad^2]", ge=0
     )
-    s_slack: float = _number(1000.0, (-2.0, 0.0, 0.0), "S: squared track violation [1/m^2]")
-    margin_m: float = _number(0.01, LENGTH, "distance kept from the track edges [m]")
-    horizon: int = _number(40, NONE, "stages that the OCP looks ahead [-]", ge=2, le=100)
+    s_slack: float = _number(1000.0, "S: squared track violation [1/m^2]")
+    margin_m: float = _number(0.01, "distance kept from the track edges [m]")
+    horizon: int = _number(40, "stages that the OCP looks ahead [-]", ge=2, le=100)
     free_stages: int = _number(
-        10, NONE, "first stages whose inputs each change by themselves in one QP [-]", ge=1, le=100
+        10, "first stages whose inputs each change by themselves in one QP [-]", ge=1, le=100
     )
     block_stages: int = _number(
-        5, NONE, "of the stages after them, so many change alike; 1: no blocks [-]", ge=1, le=100
+        5, "of the stages after them, so many change alike; 1: no blocks [-]", ge=1, le=100
     )
 
     @property
@@ -293,27 +263,22 @@ class CautionTuning(_Section):
     The sizes of deviations and efforts are those that the feedback about a plan weighs equally.
     """
 
-    position_m: float = _number(0.1, LENGTH, "deviation of a coordinate [m]")
-    heading_rad: float = _number(1.0, NONE, "deviation of the heading [rad]")
-    speed_mps: float = _number(1.0, SPEED, "deviation of a velocity [m/s]")
-    yaw_rate_radps: float = _number(10.0, YAW_RATE, "deviation of the yaw rate [rad/s]")
-    steering_rad: float = _number(1.0, NONE, "deviation of the steering angle [rad]")
-    command: float = _number(1.0, COMMAND, "effort of the drive command [command]")
-    steering_rate_radps: float = _number(3.0, YAW_RATE, "effort of the steering rate [rad/s]")
+    position_m: float = _number(0.1, "deviation of a coordinate [m]")
+    heading_rad: float = _number(1.0, "deviation of the heading [rad]")
+    speed_mps: float = _number(1.0, "deviation of a velocity [m/s]")
+    yaw_rate_radps: float = _number(10.0, "deviation of the yaw rate [rad/s]")
+    steering_rad: float = _number(1.0, "deviation of the steering angle [rad]")
+    command: float = _number(1.0, "effort of the drive command [command]")
+    steering_rate_radps: float = _number(3.0, "effort of the steering rate [rad/s]")
     share: float = _number(
         0.5,
-        NONE,
         "of half the track's width that uncertainty may take before the car slows down [-]",
         gt=0,
         le=1,
     )
-    slower_ps: float = _number(
-        2.5, YAW_RATE, "speed of the reference then falls at this rate [1/s]"
-    )
-    faster_ps: float = _number(0.5, YAW_RATE, "and rises again at this one [1/s]")
-    least: float = _number(
-        0.5, NONE, "share of the line's speed that is never undercut [-]", gt=0, le=1
-    )
+    slower_ps: float = _number(2.5, "speed of the reference then falls at this rate [1/s]")
+    faster_ps: float = _number(0.5, "and rises again at this one [1/s]")
+    least: float = _number(0.5, "share of the line's speed that is never undercut [-]", gt=0, le=1)
 
     @property
     def pace(self) -> list[tuple[str, float]]:
@@ -325,61 +290,54 @@ class CautionTuning(_Section):
 class PursuitTuning(_Section):
     """Pure pursuit, which drives for training data."""
 
-    lookahead_m: float = _number(0.16, LENGTH, "distance of the target at standstill [m]")
-    lookahead_s: float = _number(0.05, TIME, "distance added per speed [s]")
-    speed_gain_spm: float = _number(
-        1.8, COMMAND_PER_SPEED, "drive command per speed error [command s/m]"
-    )
+    lookahead_m: float = _number(0.16, "distance of the target at standstill [m]")
+    lookahead_s: float = _number(0.05, "distance added per speed [s]")
+    speed_gain_spm: float = _number(1.8, "drive command per speed error [command s/m]")
     excite_d: float = _number(
-        0.1, COMMAND, "standard deviation of the disturbance of the drive command [command]"
+        0.1, "standard deviation of the disturbance of the drive command [command]"
     )
-    sway_s: float = _number(3.7, TIME, "period in which the target speed rises and falls [s]")
+    sway_s: float = _number(3.7, "period in which the target speed rises and falls [s]")
     faster: float = _number(
-        0.15, NONE, "share of its mean by which the target speed rises [-]", ge=0, lt=1
+        0.15, "share of its mean by which the target speed rises [-]", ge=0, lt=1
     )
-    slower: float = _number(0.15, NONE, "share by which it falls [-]", ge=0, lt=1)
-    speed_min_mps: float = _number(0.4, SPEED, "target speed is never below [m/s]")
-    keep_m: float = _number(0.12, LENGTH, "distance of the driven line from the track's edges [m]")
-    preview_s: float = _number(0.12, TIME, "how far ahead the line's speed is taken [s]")
-    steering_s: float = _number(0.04, TIME, "how far ahead the line's curvature is taken [s]")
+    slower: float = _number(0.15, "share by which it falls [-]", ge=0, lt=1)
+    speed_min_mps: float = _number(0.4, "target speed is never below [m/s]")
+    keep_m: float = _number(0.12, "distance of the driven line from the track's edges [m]")
+    preview_s: float = _number(0.12, "how far ahead the line's speed is taken [s]")
+    steering_s: float = _number(0.04, "how far ahead the line's curvature is taken [s]")
     understeer_s2pm: float = _number(
-        0.008, (0.0, -1.0, 0.0), "steering angle added per acceleration in a bend [rad s^2/m]"
+        0.008, "steering angle added per acceleration in a bend [rad s^2/m]"
     )
-    damping_s: float = _number(0.01, TIME, "steering angle per excess of the yaw rate [s]")
-    window_m: float = _number(0.4, LENGTH, "way ahead in which the nearest point is sought [m]")
-    lost_m: float = _number(0.5, LENGTH, "farther from it, the whole line is searched [m]")
-    drive_s: float = _number(12.0, TIME, "length of a training drive [s]")
+    damping_s: float = _number(0.01, "steering angle per excess of the yaw rate [s]")
+    window_m: float = _number(0.4, "way ahead in which the nearest point is sought [m]")
+    lost_m: float = _number(0.5, "farther from it, the whole line is searched [m]")
+    drive_s: float = _number(12.0, "length of a training drive [s]")
 
 
 class GateTuning(_Section):
     """What new weights are judged by, and which samples are learned from."""
 
     resolution_vx_mps2: float = _number(
-        0.1, ACCELERATION, "error in the longitudinal acceleration that does not count [m/s^2]"
+        0.1, "error in the longitudinal acceleration that does not count [m/s^2]"
     )
     resolution_vy_mps2: float = _number(
-        0.2, ACCELERATION, "error in the lateral acceleration that does not count [m/s^2]"
+        0.2, "error in the lateral acceleration that does not count [m/s^2]"
     )
     resolution_omega_radps2: float = _number(
-        2.0, YAW_ACCELERATION, "error in the yaw acceleration that does not count [rad/s^2]"
+        2.0, "error in the yaw acceleration that does not count [rad/s^2]"
     )
     absurd_vx_mps2: float = _number(
-        100.0, ACCELERATION, "longitudinal acceleration that no correction amounts to [m/s^2]"
+        100.0, "longitudinal acceleration that no correction amounts to [m/s^2]"
     )
     absurd_vy_mps2: float = _number(
-        100.0, ACCELERATION, "lateral acceleration that no correction amounts to [m/s^2]"
+        100.0, "lateral acceleration that no correction amounts to [m/s^2]"
     )
     absurd_omega_radps2: float = _number(
-        1000.0, YAW_ACCELERATION, "yaw acceleration that no correction amounts to [rad/s^2]"
+        1000.0, "yaw acceleration that no correction amounts to [rad/s^2]"
     )
-    moving_mps: float = _number(
-        0.05, SPEED, "slower, a car stands, and its samples are left out [m/s]"
-    )
-
+    moving_mps: float = _number(0.05, "slower, a car stands, and its samples are left out [m/s]")
     spin_rad: float = _number(
-        0.8,
-        NONE,
-        "slip angle of the body beyond which a car spins, and its samples are left out [rad]",
+        0.8, "slip angle of the body beyond which a car spins, and its samples are left out [rad]"
     )
 
     @property
@@ -396,12 +354,8 @@ class GateTuning(_Section):
 class DrivingTuning(_Section):
     """Stopping on command."""
 
-    stop_mps2: float = _number(
-        1.5, ACCELERATION, "deceleration along the line of a stop on command [m/s^2]"
-    )
-    standing_mps: float = _number(
-        0.1, SPEED, "speed below which a stop ends in holding the brake [m/s]"
-    )
+    stop_mps2: float = _number(1.5, "deceleration along the line of a stop on command [m/s^2]")
+    standing_mps: float = _number(0.1, "speed below which a stop ends in holding the brake [m/s]")
 
 
 class Tuning(_Section):
@@ -430,8 +384,3 @@ class Tuning(_Section):
             if isinstance(stated, dict) and section is not None:
                 values[name] = section.defaults(scales) | stated
         return values
-
-    @classmethod
-    def of(cls, scales: Scales) -> Self:
-        """What a car of these scales has by default."""
-        return cls.model_validate(cls.completed({}, scales))
