@@ -18,11 +18,11 @@ from pathlib import Path
 from subprocess import PIPE, STDOUT, Popen, TimeoutExpired
 from typing import IO, Annotated, Any, Final, cast
 
+from bayesrace.interpreter import RUN_MODULE
 from msgspec import Meta, MsgspecError, msgpack
 
 from bayesrace.errors import InputError
 from bayesrace.files import temporary_folder
-from bayesrace.interpreter import RUN_MODULE
 from bayesrace.plant.fmu.inspection import extract, library
 from bayesrace.plant.fmu.wiring import Value
 from bayesrace.plant.fmu.worker import LONGEST
