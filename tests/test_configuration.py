@@ -246,10 +246,6 @@ def test_insecure_is_possible_and_warns_each_time() -> None:
     assert where in line
 
 
-def test_an_encrypted_endpoint_needs_a_certificate(cli: Cli) -> None:
-    refused(cli("plant", "--endpoint", "tls/127.0.0.1:7447"), "certificate", "bayesrace certs")
-
-
 def test_an_encrypted_endpoint_has_no_settings_of_its_own() -> None:
     """With enable_mtls=false there, Zenoh lets everyone in."""
     own = Credentials(folder=Path("certs"), name="plant", ends_s=2e9, members=Members())

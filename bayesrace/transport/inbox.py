@@ -67,7 +67,6 @@ class Kind(Enum):
     ALIVE = "alive"
     GONE = "gone"
     SIGNAL = "signal"
-    RESULT = "result"
 
 
 class Item(NamedTuple):
@@ -78,7 +77,7 @@ class Item(NamedTuple):
     """Topic, service or source; empty for signals."""
     value: Any
     """MESSAGE: the message, None if the topic's decoder has refused it; REQUEST: :class:`Request`;
-    SIGNAL: its number; RESULT: what another thread of this process has :meth:`put`; else None."""
+    SIGNAL: its number; else None."""
     received_ns: int
     """Own monotonic clock on arrival."""
     key: str = ""

@@ -15,7 +15,7 @@ from bayesrace.tracks import write_track
 from bayesrace.transport import Credentials, Endpoints, free_endpoint, open_session
 from tests.command_line import Cli, refused
 from tests.conftest import Circuit
-from tests.programs import finish, start, until
+from tests.programs import until
 from tests.security.authority import CAR, Bundles, bundles, written
 from tests.security.intruder import listening
 
@@ -155,20 +155,6 @@ def test_a_certificate_for_another_car_is_refused(
     refused(outcome, "is for car 'blue', not for 'orca'", "--name blue")
 
 
-def test_a_controller_without_a_plant_says_so_and_waits(
-    bundles: Bundles, tmp_path: Path, arguments: dict[str, tuple[str | Path, ...]]
-) -> None:
-    plant_at, here = free_endpoint("tls"), free_endpoint("tls")
-    config = written(tmp_path, bundles, plant_at, here)
-    process = start("controller", *arguments["controller"], "--config", config)
-    assert process.stderr is not None
-    lines = [process.stderr.readline() for _ in range(3)]
-    assert process.poll() is None
-    process.kill()
-    finish(process)
-    assert NO_LINK.format(plant_at) in "".join(lines)
-
-
 # doctor ------------------------------------------------------------------------------------------
 
 
@@ -188,13 +174,7 @@ def test_doctor_tries_everything(cli: Cli, bundles: Bundles, tmp_path: Path) -> 
 
 
 def test_doctor_says_what_else_may_be_wrong(cli: Cli, bundles: Bundles, tmp_path: Path) -> None:
-    where = free_endpoint("tls")
-    config = written(tmp_path, bundles, where, where)
-    with listening(where, bundles.path("foreign-plant")):
-        found = cli("doctor", "--config", config)
-    assert found.code == 1
-    assert f"FAULT  {where} has a certificate {FOREIGN}" in found.out
-    beyond = tmp_path / "beyond.toml"
+    where, beyond = free_endpoint("tls"), tmp_path / "beyond.toml"
     beyond.write_text("[network]\nplant = ['tcp/10.0.0.1:1']\n")
     assert "could drive the car" in cli("doctor", "--config", beyond).out
     shutil.copytree(bundles.path("revoked"), tmp_path / "certs" / "controller")
