@@ -18,7 +18,6 @@ from pathlib import Path
 from subprocess import PIPE, STDOUT, Popen, TimeoutExpired
 from typing import IO, Annotated, Any, Final, cast
 
-from bayesrace.interpreter import RUN_MODULE
 from msgspec import Meta, MsgspecError, msgpack
 
 from bayesrace.errors import InputError
@@ -27,6 +26,7 @@ from bayesrace.plant.fmu.inspection import extract, library
 from bayesrace.plant.fmu.wiring import Value
 from bayesrace.plant.fmu.worker import LONGEST
 from bayesrace.plant.vehicle import FmuFault
+from bayesrace.processes import RUN_MODULE
 
 __all__ = ["FmuHost"]
 
