@@ -13,7 +13,6 @@ from collections import deque
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
 from pathlib import Path
 from typing import IO, Any, Final, Generic, NamedTuple, TypeVar, cast
 
@@ -37,9 +36,10 @@ from bayesrace.messages import (
     decode_json,
     json_schema,
     to_json,
+    topic_of,
 )
 
-__all__ = ["Entry", "LogReader", "LogWriter", "topic_of"]
+__all__ = ["Entry", "LogReader", "LogWriter"]
 
 M = TypeVar("M", bound=Message)
 
@@ -53,17 +53,6 @@ _DAMAGED: Final = (
 _LONGEST_GAP_NS: Final = 10_000_000_000
 """Between two states of a run; a longer one is no driving."""
 _MCAP_MAGIC: Final = b"\x89MCAP0\r\n"
-_BY_PREFIX: Final = {topic.key.split("/")[2]: topic for topic in TOPICS}
-
-
-@lru_cache(512)
-def topic_of(key: str) -> Topic[Any] | None:
-    """The table's row for a key such as ``bayesrace/orca/state``; None for any other key."""
-    parts = key.split("/")
-    topic = _BY_PREFIX.get(parts[2]) if len(parts) > 2 and parts[0] == "bayesrace" else None
-    if topic is None or len(parts) != len(topic.key.split("/")):
-        return None
-    return topic if len(parts) == 3 or parts[3] in topic.sources else None
 
 
 class _CarClock:

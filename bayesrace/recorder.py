@@ -15,8 +15,8 @@ from typing import Any, Final, Self
 import zenoh
 
 from bayesrace.errors import InputError
-from bayesrace.log import LogWriter, topic_of
-from bayesrace.messages import EVENT, EVERYTHING, HEARTBEAT, Event, car_key, encode
+from bayesrace.log import LogWriter
+from bayesrace.messages import EVENT, EVERYTHING, HEARTBEAT, Event, car_key, encode, topic_of
 from bayesrace.transport.publisher import Numbering
 
 __all__ = ["FLUSH_PERIOD_S", "Recorder", "RecorderCounters"]

@@ -42,8 +42,8 @@ from bayesrace.learning.dataset import (
     dataset_from_arrays,
     filter_dataset,
 )
-from bayesrace.log import LogReader, topic_of
-from bayesrace.messages import STATE, TELEMETRY, TRUTH
+from bayesrace.log import LogReader
+from bayesrace.messages import STATE, TELEMETRY, TRUTH, topic_of
 from bayesrace.vehicles import CarParameters, builtin_cars, car_text, described_car
 
 __all__ = ["CYCLES", "MAX_BYTES", "STATES", "LogFacts", "Samples", "dataset_from_columns"]

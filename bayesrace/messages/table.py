@@ -8,6 +8,7 @@ secured links (:mod:`bayesrace.transport.session`) is generated from these colum
 
 import re
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, Final, Generic, Literal, TypeVar
 
 from bayesrace.errors import InputError
@@ -32,7 +33,7 @@ __all__ = [
     "ACTUATION", "ALIVE", "ALIVE_SOURCES", "BRAKING", "COMMAND", "EVENT", "EVERYTHING", "HEARTBEAT",
     "RECORDERS", "ROLE_OF", "ROLLBACK", "RUN", "SERVICES", "STATE", "STATUS", "STOP", "TELEMETRY",
     "TOPICS", "TRUTH", "WEIGHTS", "Qos", "Role", "Service", "Source", "Topic", "car_key",
-    "is_car_name",
+    "is_car_name", "topic_of",
 ]  # fmt: skip
 
 M = TypeVar("M", bound=Message)
@@ -176,6 +177,7 @@ EVERYTHING: Final = "bayesrace/{car}/**"
 """What a recorder subscribes to; it receives what its role may read."""
 RECORDERS: Final[tuple[Role, ...]] = ("director", "viewer")
 """Who may."""
+_BY_PREFIX: Final = {topic.key.split("/")[2]: topic for topic in TOPICS}
 
 
 def is_car_name(name: str) -> bool:
@@ -191,3 +193,13 @@ def car_key(template: str, car: str, source: str = "") -> str:
             "use up to 40 letters, digits, '-' or '_'"
         )
     return template.format(car=car, source=source)
+
+
+@lru_cache(512)
+def topic_of(key: str) -> Topic[Any] | None:
+    """The table's row for a key such as ``bayesrace/orca/state``; None for any other key."""
+    parts = key.split("/")
+    topic = _BY_PREFIX.get(parts[2]) if len(parts) > 2 and parts[0] == "bayesrace" else None
+    if topic is None or len(parts) != len(topic.key.split("/")):
+        return None
+    return topic if len(parts) == 3 or parts[3] in topic.sources else None

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from bayesrace.arrays import Floats
 from bayesrace.columns import Columns, LogColumns
 from bayesrace.errors import InputError
-from bayesrace.log import LogReader, topic_of
-from bayesrace.messages import ACTUATION, HEARTBEAT, STATE, TELEMETRY, TRUTH, Topic
+from bayesrace.log import LogReader
+from bayesrace.messages import ACTUATION, HEARTBEAT, STATE, TELEMETRY, TRUTH, Topic, topic_of
 
 __all__ = ["ANSWER", "BESIDE", "LEGS", "MOST_CYCLES", "ClockMap", "Cycles", "begins_anew"]
 __all__ += ["read_tables", "split"]
