@@ -13,8 +13,7 @@ from typing import Final, NamedTuple
 from bayesrace.configuration import Configuration
 from bayesrace.errors import InputError
 from bayesrace.messages import Role
-from bayesrace.operation.analysis.network_status import SOURCES
-from bayesrace.operation.lifecycle import find
+from bayesrace.operation.lifecycle import SOURCES, find
 from bayesrace.transport import Credentials, Endpoints, open_session
 from bayesrace.transport.credentials import CERTIFICATE_EXPIRED, CERTIFICATE_NOT_YET, NEWEST_LIST
 from bayesrace.transport.endpoints import Address, address_of

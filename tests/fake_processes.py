@@ -8,8 +8,7 @@ from typing import Any
 import pytest
 
 from bayesrace.messages import COMMAND, HEARTBEAT, STATUS, Command, Reply, Role, Status
-from bayesrace.operation.analysis.network_status import NetworkStatus
-from bayesrace.operation.lifecycle import ask_statuses, find
+from bayesrace.operation.lifecycle import NetworkStatus, ask_statuses, find
 from bayesrace.transport import (
     Endpoints,
     Inbox,

@@ -14,8 +14,14 @@ from rich.text import Text
 
 from bayesrace.errors import InputError
 from bayesrace.messages import Status
-from bayesrace.operation.analysis.network_status import SOURCES, NetworkStatus, ProcessStatus
-from bayesrace.operation.lifecycle import ask_statuses, find, follow
+from bayesrace.operation.lifecycle import (
+    SOURCES,
+    NetworkStatus,
+    ProcessStatus,
+    ask_statuses,
+    find,
+    follow,
+)
 from bayesrace.operation.terminal import printable
 from bayesrace.operation.terminal.terminal import Terminal, plain_table
 from bayesrace.transport import Endpoints, open_session
