@@ -49,8 +49,6 @@ __all__ = [
     "prepare",
     "progress_artefact",
     "trained_weights",
-    "training_drive",
-    "training_samples",
     "training_settings",
     "updated_weights",
 ]
@@ -156,7 +154,7 @@ def prepare(
             artefacts = [_artefact(settings, model) for model in models]
     if weights is None:
         with stages.stage("training drive (pure pursuit)"):
-            training = training_drive(training_track, car, settings, artefacts[0])
+            training = _training_drive(training_track, car, settings, artefacts[0])
         with stages.stage("train the residual") as stage:
             learned = training.samples, settings.discretisation, training_settings(settings)
             weights = trained_weights(*learned, progress=stage.update)
@@ -179,6 +177,12 @@ def _prepared_track(
     return PreparedTrack(track, line, track_file, line_file or cached)
 
 
+def _place(name: str, packages: Sequence[str], *inputs: str | bytes) -> Path:
+    """Where the cache keeps what is made from these inputs, by our code and these packages."""
+    by = software(SOURCES, ("casadi", "numpy", *packages))
+    return cache_folder() / name.format(digest([*inputs, cpu_identity(), *by]))
+
+
 def _training_track(track: Track, car: CarParameters, settings: RaceLineSettings) -> PreparedTrack:
     """With a racing line that leaves room for a training drive, or as much as the track allows."""
     margin_m = training_margin_m(track, car, settings.margin_m)
@@ -189,31 +193,23 @@ def _training_track(track: Track, car: CarParameters, settings: RaceLineSettings
     return _prepared_track(track, car, settings)
 
 
-def training_drive(
+def _training_drive(
     prepared: PreparedTrack, car: CarParameters, settings: PreparationSettings, artefact: Path
 ) -> Training:
-    """The pure-pursuit drive, from the cache if it is there; its log is like a race's.
-
-    ``artefact``: a controller built for the car, whose control cycle drives.
-    Raises InputError for an FMU or map that cannot be used, FmuFault if the FMU fails.
-    """
+    """The pure-pursuit drive, from the cache if it is there; its log is like a race's."""
     files = [path for path in (settings.fmu, settings.fmu_map) if path is not None]
     others = [] if settings.simulator == "equations" else [settings.simulator]
     track, line = prepared.track, prepared.line
     duration_s = settings.collect_s or drive_length_s(car, line)
-    identity = digest(
-        [
-            track.identity,
-            *(column.tobytes() for column in (line.s_m, line.x_m, line.y_m, line.vx_mps)),
-            car.model_dump_json(),
-            settings.model_dump_json(include=_SHAPES_A_DRIVE),
-            f"{duration_s!r} {len(files)}",
-            *(read_whole(path, "the FMU or its map", _LARGEST_FMU) for path in files),
-            cpu_identity(),
-            *software(SOURCES, ("casadi", "mcap", "numpy", *others)),
-        ]
-    )
-    path = cache_folder() / f"drive-{identity}.mcap"
+    path = _place(
+        "drive-{}.mcap", ("mcap", *others),
+        track.identity,
+        *(column.tobytes() for column in (line.s_m, line.x_m, line.y_m, line.vx_mps)),
+        car.model_dump_json(),
+        settings.model_dump_json(include=_SHAPES_A_DRIVE),
+        f"{duration_s!r} {len(files)}",
+        *(read_whole(path, "the FMU or its map", _LARGEST_FMU) for path in files),
+    )  # fmt: skip
 
     def make(partial: Path) -> None:
         drive_for_training(settings, track, line, car, artefact, partial)
@@ -236,8 +232,11 @@ def drive_for_training(
     artefact: Path,
     log: Path,
 ) -> Driven:
-    """The pure-pursuit drive of the car that the settings simulate, logged; see
-    :func:`training_drive`."""
+    """The pure-pursuit drive of the car that the settings simulate, logged.
+
+    ``artefact``: a controller built for the car, whose control cycle drives.
+    Raises InputError for an FMU or map that cannot be used, FmuFault if the FMU fails.
+    """
     pursuit = settings.pursuit.model_copy(update={"seed": settings.seed})
     duration_s = settings.collect_s or drive_length_s(car, line)
     simulated_by = settings.true_car, settings.fmu, settings.fmu_map, 1 / PLANT.step_s, compiled
@@ -259,15 +258,6 @@ def training_settings(settings: PreparationSettings) -> TrainingSettings:
     )
 
 
-def training_samples(settings: PreparationSettings) -> Dataset:
-    """Those of the training drive alone."""
-    car = settings.driven_car
-    track = load_track(settings.train_track, car.width_m)
-    driven_on = _training_track(track, car, settings.raceline)
-    artefact = _artefact(settings, "e_kinematic")
-    return training_drive(driven_on, car, settings, artefact).samples
-
-
 def trained_weights(
     samples: Dataset,
     discretisation: Discretisation,
@@ -276,18 +266,14 @@ def trained_weights(
     progress: Progress | None = None,
 ) -> Path:
     """File of what :func:`train` returns; trained only if these arguments are new."""
-    identity = digest(
-        [
-            samples.digest(),
-            str(samples.car.mirrored_samples),
-            discretisation.model_dump_json(),
-            settings.model_dump_json(exclude={"threads"}),
-            b"" if initial is None else encode_weights(replace(initial, created_utc_ns=0)),
-            cpu_identity(),
-            *software(SOURCES, ("casadi", "numpy", "scipy")),
-        ]
-    )
-    path = cache_folder() / f"weights-{identity}.bin"
+    path = _place(
+        "weights-{}.bin", ("scipy",),
+        samples.digest(),
+        str(samples.car.mirrored_samples),
+        discretisation.model_dump_json(),
+        settings.model_dump_json(exclude={"threads"}),
+        b"" if initial is None else encode_weights(replace(initial, created_utc_ns=0)),
+    )  # fmt: skip
 
     def make(partial: Path) -> None:
         # Imported here: it takes a second, and most commands find their weights in the cache.

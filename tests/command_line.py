@@ -1,10 +1,12 @@
 """The command line in the tests' own process, which is faster than a process of its own."""
 
 import logging
+import os
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from unittest.mock import patch
 
 import pytest
 
@@ -39,7 +41,7 @@ def cli(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], tmp_
     def call(*arguments: str | Path) -> Outcome:
         monkeypatch.setattr(sys, "argv", ["bayesrace", *map(str, arguments)])
         capfd.readouterr()
-        with pytest.raises(SystemExit) as end:
+        with pytest.raises(SystemExit) as end, patch.dict(os.environ):  # --config sets a variable
             main()
         code = end.value.code
         assert code is None or isinstance(code, int)

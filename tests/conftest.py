@@ -5,6 +5,8 @@ Everything is synthetic and made in seconds: no optimal racing line, no trained 
 
 import os
 import re
+import shutil
+import subprocess
 from collections.abc import Callable, Generator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -28,10 +30,11 @@ from bayesrace.tracks import Track
 from bayesrace.vehicles import CarParameters, get_car
 from bayesrace.vehicles.models import Model, dynamic, e_kinematic
 from tests.command_line import cli
-from tests.peanut_race import peanut_race, peanut_track
+from tests.programs import Race, leftovers, peanut
+from tests.shared import session_folder
 from tests.zig import ziglang
 
-__all__ = ["cli", "peanut_race", "peanut_track", "ziglang"]  # fixtures for all tests
+__all__ = ["cli", "ziglang"]  # fixtures for all tests
 
 
 # the components that change sign in a mirror at the x axis
@@ -329,3 +332,27 @@ def recorded(
     step.set_weights(weights)
     step.set_path(circuit.table)
     return drive(step, circuit, 300)[0]
+
+
+@pytest.fixture(scope="session")
+def peanut_track(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """File of the shortest track."""
+    folder = session_folder(tmp_path_factory, "track", lambda path: peanut(path / "peanut.csv"))
+    return folder / "peanut.csv"
+
+
+@pytest.fixture(scope="session")
+def peanut_race(peanut_track: Path, tmp_path_factory: pytest.TempPathFactory) -> Race:
+    """A race that collects and drives on the shortest track, all else by default."""
+
+    def make(folder: Path) -> None:
+        out = tmp_path_factory.mktemp("race") / "driven"
+        tracks = ("--track", peanut_track, "--train-track", peanut_track, "--progress-drives", "2")
+        race = Race.running(out, *tracks)()
+        assert leftovers(race.pid) == {}
+        shutil.copytree(race.out, folder / "run")
+        (folder / "stdout").write_text(race.process.stdout)
+
+    folder = session_folder(tmp_path_factory, "race", make)
+    text = (folder / "stdout").read_text()
+    return Race(folder / "run", 0, subprocess.CompletedProcess([], 0, text, ""))

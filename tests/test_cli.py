@@ -1,6 +1,8 @@
 """The command line as a program: help that reads well, its start, its output on any terminal."""
 
 import gc
+import io
+import logging
 import re
 import subprocess
 import sys
@@ -8,10 +10,16 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from rich.table import Table
 
 from bayesrace.operation.system import child
+from bayesrace.operation.terminal import PrintableFormatter
+from bayesrace.operation.terminal.terminal import Terminal
 from tests.command_line import Cli, refused
 from tests.programs import ROOT, environment, finish, run, start
+
+EVIL = "a\x1b[2Jb\x07c"
+"""Of which a terminal would obey a part."""
 
 SUBCOMMANDS = (
     "race", "drive", "report", "bench", "tracks", "cars", "raceline", "collect", "train", "build",
@@ -137,6 +145,23 @@ def test_a_terminal_without_our_characters_gets_others(tmp_path: Path, command: 
 
 def test_names_do_not_command_the_terminal(cli: Cli) -> None:
     refused(cli("tracks", "evil\x1b[2Jname.csv"), "evil·[2Jname.csv")
+
+
+def test_tables_hold_no_escape_sequences_but_their_own() -> None:
+    text = io.StringIO()
+    table = Table("track", title=EVIL)
+    table.add_row(f"[bold]{EVIL}[/bold]")
+    Terminal(file=text, force_terminal=True, width=60, color_system="truecolor").print(table)
+    printed = text.getvalue()
+    assert "\x1b[2J" not in printed
+    assert "\x07" not in printed
+    assert printed.count("a·[2Jb") == 2
+    assert "\x1b[1m" in printed
+
+
+def test_log_lines_hold_no_escape_sequences() -> None:
+    record = logging.LogRecord("plant", logging.INFO, "", 0, "said %s\nand more", (EVIL,), None)
+    assert PrintableFormatter("%(message)s").format(record) == "said a·[2Jb·c\nand more"
 
 
 def test_programs_that_are_started_import_nothing_from_the_current_folder(

@@ -48,28 +48,21 @@ def test_the_controller_drives_with_its_own_extra_alone(
     assert end.data["reason"] == "laps"
 
 
-def test_a_missing_package_of_campaigns_is_named_with_its_extra(
-    cli: Cli, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    for name in ("page", "summary", "results"):
-        monkeypatch.delitem(sys.modules, f"bayesrace.studies.campaign.{name}", raising=False)
-    monkeypatch.setitem(sys.modules, "pandas", None)
-    refused(cli("campaign-report", tmp_path), "pandas", "bayesrace[campaign]")
-
-
-def test_a_missing_package_of_certificates_is_named_with_its_extra(
-    cli: Cli, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.delitem(sys.modules, "bayesrace.operation.certificates", raising=False)
-    monkeypatch.setitem(sys.modules, "cryptography", None)
-    refused(cli("certs", "init"), "cryptography", "bayesrace[certificates]")
-
-
+@pytest.mark.parametrize(
+    ("modules", "package", "command", "extra"),
+    [
+        ("studies.campaign.page studies.campaign.summary studies.campaign.results", "pandas",
+         "campaign-report .", "campaign"),
+        ("operation.certificates", "cryptography", "certs init", "certificates"),
+        ("plant.fmu", "fmpy", "fmu inspect FMU", "fmu"),
+    ],
+)  # fmt: skip
 def test_a_missing_package_is_named_with_the_extra_that_brings_it(
-    cli: Cli, monkeypatch: pytest.MonkeyPatch
+    cli: Cli, monkeypatch: pytest.MonkeyPatch, modules: str, package: str, command: str, extra: str
 ) -> None:
     fmu = packed_car()
-    for name in [one for one in sys.modules if one.startswith(("bayesrace.plant.fmu", "fmpy"))]:
+    users = tuple(f"bayesrace.{one}" for one in modules.split())
+    for name in [one for one in sys.modules if one.startswith((*users, package))]:
         monkeypatch.delitem(sys.modules, name)
-    monkeypatch.setitem(sys.modules, "fmpy", None)
-    refused(cli("fmu", "inspect", fmu), "fmpy", "bayesrace[fmu]")
+    monkeypatch.setitem(sys.modules, package, None)
+    refused(cli(*command.replace("FMU", str(fmu)).split()), package, f"bayesrace[{extra}]")

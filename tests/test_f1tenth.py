@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from fmpy.validation import validate_fmu
+from rich.console import Console
 
 from bayesrace.arrays import Floats
 from bayesrace.codegen.build import build
@@ -18,8 +19,9 @@ from bayesrace.learning.settings import TrainingSettings
 from bayesrace.learning.training import train
 from bayesrace.operation.analysis.results import read_result
 from bayesrace.operation.closed_loop import ClosedLoop, drive_compiled
-from bayesrace.operation.preparation import trained_weights, training_samples, training_settings
+from bayesrace.operation.preparation import prepare
 from bayesrace.operation.settings import PreparationSettings, RaceSettings
+from bayesrace.operation.terminal.terminal import stages_on
 from bayesrace.plant.simulator import Simulator
 from bayesrace.plant.vehicle import Vehicle, open_vehicle
 from bayesrace.raceline import RaceLine, racing_line, read_raceline_for
@@ -107,9 +109,8 @@ def test_a_lap_that_was_learned_from_pure_pursuit_stays_on_the_small_track(tmp_p
 @pytest.fixture(scope="module")
 def first_weights() -> GpWeights:
     """Those that a race on the small track begins with, of a seed whose GP errs at low speed."""
-    settings = PreparationSettings(car=CAR, seed=1)
-    samples = training_samples(settings)
-    return read_weights(trained_weights(samples, PREDICTION, training_settings(settings)))
+    with stages_on(Console(quiet=True)) as stages:
+        return read_weights(prepare(PreparationSettings(car=CAR, seed=1), (), stages).weights)
 
 
 @pytest.mark.parametrize(("what", "found"), [("as learned", ""), ("flip omega", "back at 1")])

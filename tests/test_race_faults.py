@@ -13,6 +13,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -85,22 +86,16 @@ class Racing:
         assert (self.out / "report.html").stat().st_size > 10_000
 
 
+def begin(folder: Path, *options: str, **how: Any) -> subprocess.Popen[str]:
+    """Starts a race on a short track into the folder ``out``, without runs at the limit."""
+    track = peanut(folder / "peanut.csv")
+    tracks = ("--track", track, "--train-track", track, "--progress-drives", "0")
+    return start("race", "--out", folder / "out", *tracks, *options, **how)
+
+
 @pytest.fixture
 def racing(tmp_path: Path) -> Iterator[Racing]:
-    track = peanut(tmp_path / "peanut.csv")
-    out = tmp_path / "out"
-    tracks = ("--track", track, "--train-track", track)
-    process = start(
-        "race",
-        "--progress-drives",
-        "0",
-        "--out",
-        out,
-        *tracks,
-        "--laps",
-        "100",
-        start_new_session=True,
-    )
+    process, out = begin(tmp_path, "--laps", "100", start_new_session=True), tmp_path / "out"
 
     def driving() -> bool:
         assert process.poll() is None, process.communicate()
@@ -127,43 +122,29 @@ def test_a_race_is_two_more_processes(racing: Racing) -> None:
 
 
 @pytest.mark.check
-def test_an_interrupt_of_the_race_alone_ends_all(racing: Racing) -> None:
-    racing.spoil("race", signal.SIGINT)
-    assert racing.end() == (130, "bayesrace: interrupted")
-    racing.assert_log_explains(ended_by_plant=True)
-
-
-@pytest.mark.check
-def test_a_killed_plant_ends_the_race(racing: Racing) -> None:
-    racing.spoil("plant", signal.SIGKILL)
-    code, said = racing.end()
-    assert code == 1
-    assert "plant was killed by signal 9" in said
-    racing.assert_log_explains(ended_by_plant=False)
+@pytest.mark.parametrize(
+    ("what", "number", "code", "words", "ended_by_plant"),
+    [
+        ("race", signal.SIGINT, 130, "bayesrace: interrupted", True),
+        ("plant", signal.SIGKILL, 1, "plant was killed by signal 9", False),
+        ("plant", signal.SIGTERM, 1, "", True),
+        ("controller", signal.SIGKILL, 1, "was killed by signal 9", True),
+    ],
+)
+def test_a_process_that_ends_ends_the_race_and_is_named(
+    racing: Racing, what: str, number: int, code: int, words: str, ended_by_plant: bool
+) -> None:
+    racing.spoil(what, number)
+    found, said = racing.end()
+    assert found == code
+    assert words in said
+    assert what in said
+    end = racing.assert_log_explains(ended_by_plant=ended_by_plant)
+    if what == "controller":
+        assert "plant was killed" not in said
+        assert end is not None
+        assert end.data["reason"] == "controller_lost"
     racing.assert_report_shows_it()
-
-
-@pytest.mark.check
-def test_a_killed_controller_ends_the_race(racing: Racing) -> None:
-    racing.spoil("controller", signal.SIGKILL)
-    code, said = racing.end()
-    assert code == 1
-    assert "was killed by signal 9" in said
-    assert "controller" in said
-    assert "plant was killed" not in said
-    end = racing.assert_log_explains(ended_by_plant=True)
-    assert end is not None
-    assert end.data["reason"] == "controller_lost"
-    racing.assert_report_shows_it()
-
-
-@pytest.mark.check
-def test_a_terminated_plant_ends_the_race_with_its_word(racing: Racing) -> None:
-    racing.spoil("plant", signal.SIGTERM)
-    code, said = racing.end()
-    assert code == 1
-    assert "plant" in said
-    racing.assert_log_explains(ended_by_plant=True)
 
 
 @pytest.mark.check
@@ -178,18 +159,7 @@ def test_a_killed_race_takes_its_processes_along(racing: Racing) -> None:
 @pytest.mark.check
 @pytest.mark.unmeasured  # an interrupt in the middle of measuring may never end
 def test_an_interrupt_before_the_first_lap(tmp_path: Path) -> None:
-    track = peanut(tmp_path / "peanut.csv")
-    process = start(
-        "race",
-        "--progress-drives",
-        "0",
-        "--out",
-        tmp_path / "out",
-        "--track",
-        track,
-        "--train-track",
-        track,
-    )
+    process = begin(tmp_path)
     until(lambda: (tmp_path / "out" / "settings.json").exists(), "the race at work")
     process.send_signal(signal.SIGINT)
     done = finish(process)
@@ -206,25 +176,19 @@ def test_a_full_disk_ends_the_race_at_once_and_the_file_is_named(tmp_path: Path)
     def limited() -> None:
         resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
 
-    track = peanut(tmp_path / "peanut.csv")
-    arguments = ("--track", track, "--train-track", track, "--out", tmp_path / "race")
-    process = start(
-        "race", "--progress-drives", "0", *arguments, "--laps", "100", preexec_fn=limited
-    )
+    process = begin(tmp_path, "--laps", "100", preexec_fn=limited)
     done = finish(process)
     assert done.returncode == 2
-    assert f"cannot write the log {tmp_path / 'race' / 'run.mcap'}: File too large" in done.stderr
+    log = tmp_path / "out" / "run.mcap"
+    assert f"cannot write the log {log}: File too large" in done.stderr
     assert leftovers(process.pid) == {}
-    assert states_of(tmp_path / "race" / "run.mcap")
+    assert states_of(log)
 
 
 @pytest.mark.check
 def test_a_pause_of_three_seconds_ends_nothing(tmp_path: Path) -> None:
     """A host that stalls, a laptop that is closed for a moment."""
-    track = peanut(tmp_path / "peanut.csv")
-    arguments = ("--track", track, "--train-track", track, "--out", tmp_path / "race")
-    process = start("race", "--progress-drives", "0", *arguments, "--laps", "1")
-    log = tmp_path / "race" / "run.mcap"
+    process, log = begin(tmp_path, "--laps", "1"), tmp_path / "out" / "run.mcap"
     for name in ("plant", "controller"):
         driven = len(states_of(log))
         until(lambda: len(states_of(log)) > driven + ENOUGH, "a lap", every_s=0.3)  # noqa: B023
@@ -234,5 +198,5 @@ def test_a_pause_of_three_seconds_ends_nothing(tmp_path: Path) -> None:
         os.kill(victim, signal.SIGCONT)
     done = finish(process)
     assert done.returncode == 0, done.stderr
-    laps = json.loads((tmp_path / "race" / "result.json").read_text())["laps"]
+    laps = json.loads((tmp_path / "out" / "result.json").read_text())["laps"]
     assert len(laps) == 4

@@ -15,11 +15,10 @@ from bayesrace.gp.weights import OUTPUTS, GpWeights, read_weights, write_weights
 from bayesrace.integrators import PREDICTION, Discretisation
 from bayesrace.learning.dataset import Dataset, concatenate, identity
 from bayesrace.learning.sources import write_npz
-from bayesrace.learning.target import KernelScore
 from bayesrace.learning.training import train
 from bayesrace.learning.validation import mismatch, unbroken, validate
 from bayesrace.operation.analysis.validation import ValidationResult, validate_weights
-from bayesrace.operation.terminal.tables import print_kernels, print_validation
+from bayesrace.operation.terminal.tables import print_validation
 from bayesrace.vehicles.models import dynamic, e_kinematic
 from tests.command_line import Cli, refused
 from tests.driven import CAR, QUICK, STEP_S, drive, write_log
@@ -189,6 +188,8 @@ def test_train_chooses_the_kernel_and_prints_why(
     arguments = ("--data", "fresh.npz", "--restarts", "0", "--points", "60")
     said = cli("train", "driven.mcap", *arguments, "--out", "new.bin").out
     assert "…" not in said.replace("residual …", "")
+    assert max(map(len, said.splitlines())) <= 80
+    assert said.count("✓") == 3
     for word in ("matern05", "matern15", "matern25", "rbf", "250 samples"):
         assert word in said
     weights = read_weights(files / "new.bin")
@@ -238,16 +239,3 @@ def test_bad_input_is_refused_in_one_line(
         write_npz(files / f"{name}.npz", data)
     said = cli(*arguments.replace("ARTEFACT", str(kinematic_artefact)).split())
     refused(said, words)
-
-
-def test_tables_of_training_fit_a_terminal() -> None:
-    kernels = [
-        KernelScore(output, kernel, 0.000123456, -12.345, kernel == "rbf")
-        for output in OUTPUTS
-        for kernel in ("matern05", "matern15", "matern25", "rbf")
-    ]
-    text = io.StringIO()
-    console = Console(file=text, width=80)
-    print_kernels(kernels, console)
-    assert "…" not in text.getvalue()
-    assert text.getvalue().count("✓") == 3

@@ -45,8 +45,7 @@ _TASKS: Final = {
     "processes.go processes.router processes.doctor configuration.config configuration.certs",
     "Learn while driving": "learning.learn learning.publish learning.rollback",
     "Measure": "tracks.limit race.bench race.latency race.paper",
-    "Many laps": "campaign.campaign campaign.campaign_report campaign.campaign_worker "
-    "campaign.tune",
+    "Many laps": "race.campaign race.campaign_report race.campaign_worker race.tune",
     "Export to other tools": "export.export export.fmu",
 }
 """Sections of the help: commands, or groups of them, in the modules of this package."""

@@ -10,8 +10,7 @@ import inspect
 import operator
 import os
 import re
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from importlib import import_module
 from inspect import Parameter
 from pathlib import Path
@@ -114,20 +113,21 @@ def configured(command: Callable[..., None]) -> Callable[..., None]:
     def run(config: Path | None, insecure: bool = False, **options: Any) -> None:
         from bayesrace.configuration import configured as configuration_of_process
 
-        with _named(config):
-            found = configuration_of_process()
-            if insecure:
-                network = found.network.model_copy(update={"insecure": True})
-                found = found.model_copy(update={"network": network})
-            if model is not None:
-                sources = options.pop("context").get_parameter_source
-                file = options.pop("settings_file", None)
-                all_ = {one: options.pop(one.name) for one in fields}
-                typed = {one: all_[one] for one in all_ if sources(one.name).name == "COMMANDLINE"}
-                options["settings"] = Given(model, found, file, typed)
-            if role is not None:
-                options[role] = found.endpoints(role, connect=options.pop("endpoint"))
-            command(**options, **dict.fromkeys(taken, found))
+        if config is not None:
+            os.environ[CONFIGURATION_VARIABLE] = str(config.absolute())
+        found = configuration_of_process()
+        if insecure:
+            network = found.network.model_copy(update={"insecure": True})
+            found = found.model_copy(update={"network": network})
+        if model is not None:
+            sources = options.pop("context").get_parameter_source
+            file = options.pop("settings_file", None)
+            all_ = {one: options.pop(one.name) for one in fields}
+            typed = {one: all_[one] for one in all_ if sources(one.name).name == "COMMANDLINE"}
+            options["settings"] = Given(model, found, file, typed)
+        if role is not None:
+            options[role] = found.endpoints(role, connect=options.pop("endpoint"))
+        command(**options, **dict.fromkeys(taken, found))
 
     run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     run.__annotations__ = {one.name: one.annotation for one in parameters}
@@ -142,12 +142,10 @@ def _settings_of(command: Callable[..., None]) -> "tuple[Any, list[_FieldOption]
     module, _, name = place.rpartition(".")
     model = getattr(import_module(module), name)
     fields = [_FieldOption(model, one) for one in names.split()]
-    parameters = [*(one.parameter for one in fields), _keyword("context", typer.Context)]
-    return (
-        model,
-        fields,
-        parameters + ([_keyword("settings_file", Path | None, _SETTINGS)] if file else []),
-    )
+    places = [*(one.parameter for one in fields), _keyword("context", typer.Context)]
+    if file:
+        places.append(_keyword("settings_file", Path | None, _SETTINGS))
+    return model, fields, places
 
 
 def _keyword(name: str, kind: Any, default: Any = Parameter.empty) -> Parameter:
@@ -173,21 +171,6 @@ def _inner_type(kind: Any) -> Any:
     """Of an optional value or a list."""
     several = NoneType in get_args(kind) or get_origin(kind) in (list, tuple)
     return _inner_type(get_args(kind)[0]) if several else kind
-
-
-@contextmanager
-def _named(config: Path | None) -> Iterator[None]:
-    """For the block, the environment variable names the file, for this process and its children."""
-    before = os.environ.get(CONFIGURATION_VARIABLE)
-    if config is not None:
-        os.environ[CONFIGURATION_VARIABLE] = str(config.absolute())
-    try:
-        yield
-    finally:
-        if config is not None and before is None:
-            del os.environ[CONFIGURATION_VARIABLE]
-        elif before is not None:
-            os.environ[CONFIGURATION_VARIABLE] = before
 
 
 class _FieldOption:
