@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from rich.console import Console
 
 from bayesrace.errors import InputError
-from bayesrace.operation.terminal.fmu_table import FmuTable
+from bayesrace.operation.terminal.fmu_table import fmu_table
 from bayesrace.plant.fmu.inspection import (
     blank_map,
     inspect,
@@ -276,7 +276,7 @@ def test_a_description_beyond_measure_is_refused_before_it_is_read(tmp_path: Pat
 
 def printed(fmu: Any) -> str:
     text = io.StringIO()
-    Console(width=100, file=text).print(FmuTable(fmu, "linux64"))
+    Console(width=100, file=text).print(fmu_table(fmu, "linux64"))
     return text.getvalue()
 
 

@@ -170,13 +170,13 @@ def inspect(
     every: bool = options.flag("--all", "Print local variables, too."),
 ) -> None:
     """Print an FMU's variables; write a map for 'bayesrace plant --fmu' to fill in."""
-    from bayesrace.operation.terminal.fmu_table import FmuTable
+    from bayesrace.operation.terminal.fmu_table import fmu_table
     from bayesrace.operation.terminal.terminal import Terminal
     from bayesrace.plant.fmu.inspection import blank_map, platforms
     from bayesrace.plant.fmu.inspection import inspect as read
 
     description = read(file)
-    Terminal().print(FmuTable(description, platforms(file), all_=every))
+    Terminal().print(fmu_table(description, platforms(file), all_=every))
     if map_file is not None:
         if map_file.exists():
             raise InputError(f"{map_file} exists already; choose another name or remove it")

@@ -4,15 +4,14 @@ import math
 from collections.abc import Iterator
 from typing import Any, Final
 
-from rich import box
-from rich.console import Console, ConsoleOptions, RenderableType
-from rich.table import Table
+from rich.console import Group
 from rich.text import Text
 
 from bayesrace.operation.terminal import printable
+from bayesrace.operation.terminal.terminal import plain_table
 from bayesrace.plant.fmu.inspection import items_of, range_of, steps_s, unit_of
 
-__all__ = ["FmuTable"]
+__all__ = ["fmu_table"]
 
 _SECTIONS: Final = {
     "inputs": ("input",),
@@ -23,44 +22,29 @@ _SECTIONS: Final = {
 _COLUMNS: Final = ("variable", "type", "unit", "start", "range", "description")
 
 
-class FmuTable:
+def fmu_table(description: Any, platforms: str, *, all_: bool = False) -> Group:
     """An FMU's interfaces, platforms and variables, for rich to print; inputs come first.
 
     Local variables, of which some tools write thousands, are counted; ``all_`` lists them too.
+    ``description``: fmpy's.
     """
-
-    def __init__(self, description: Any, platforms: str, *, all_: bool = False) -> None:
-        """``description``: fmpy's."""
-        self._fmu, self._platforms, self._all = description, platforms, all_
-
-    def __rich_console__(
-        self, console: Console, options: ConsoleOptions
-    ) -> Iterator[RenderableType]:
-        yield from _head(self._fmu, self._platforms)
-        yield self._table()
-        hidden = sum(one.causality == "local" for one in self._fmu.modelVariables)
-        if hidden and not self._all:
-            yield Text(f"and {hidden} local variable(s)", style="dim")
-
-    def _table(self) -> Table:
-        sections = {
-            title: [_cells(one) for one in self._fmu.modelVariables if one.causality in causalities]
-            for title, causalities in _SECTIONS.items()
-            if self._all or title != "locals"
-        }
-        rows = [cells for section in sections.values() for cells in section]
-        # Room goes to the names: what no variable has gets no column.
-        shown = [i for i in range(len(_COLUMNS)) if any(cells[i].plain for cells in rows)]
-        table = Table(box=box.SIMPLE_HEAD, padding=(0, 1), pad_edge=False, show_edge=False)
-        table.add_column("", style="bold")
-        for i in shown:
-            right = _COLUMNS[i] == "start"
-            table.add_column(_COLUMNS[i], justify="right" if right else "left", overflow="fold")
-        for title, section in sections.items():
-            for k, cells in enumerate(section):
-                table.add_row("" if k else title, *(cells[i] for i in shown))
-            table.add_section()
-        return table
+    variables = description.modelVariables
+    sections = {
+        title: [_cells(one) for one in variables if one.causality in causalities]
+        for title, causalities in _SECTIONS.items()
+        if all_ or title != "locals"
+    }
+    rows = [cells for section in sections.values() for cells in section]
+    # Room goes to the names: what no variable has gets no column.
+    shown = [i for i in range(len(_COLUMNS)) if any(cells[i].plain for cells in rows)]
+    table = plain_table("", *(_COLUMNS[i] for i in shown), left=1 + len(shown))
+    for title, section in sections.items():
+        for k, cells in enumerate(section):
+            table.add_row("" if k else Text(title, style="bold"), *(cells[i] for i in shown))
+        table.add_section()
+    hidden = sum(one.causality == "local" for one in variables)
+    more = [Text(f"and {hidden} local variable(s)", style="dim")] if hidden and not all_ else []
+    return Group(*_head(description, platforms), table, *more)
 
 
 def _head(fmu: Any, platforms: str) -> Iterator[Text]:

@@ -5,11 +5,10 @@ import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Final, Literal
+from typing import Final
 
-from rich.console import Console, ConsoleOptions, RenderableType
+from rich.console import Group, RenderableType
 from rich.live import Live
-from rich.table import Table
 from rich.text import Text
 
 from bayesrace.errors import InputError
@@ -26,25 +25,22 @@ from bayesrace.operation.terminal import printable
 from bayesrace.operation.terminal.terminal import Terminal, plain_table
 from bayesrace.transport import Endpoints, open_session
 
-__all__ = ["COUNTERS_SHOWN", "StatusTable", "show_status"]
+__all__ = ["COUNTERS_SHOWN", "show_status", "status_table"]
 
 _PERIOD_S: Final = 0.2
 """Period of the display that follows the cars."""
 
-_VALUES: Final[tuple[tuple[str, Literal["left", "right"]], ...]] = (
-    ("state", "left"),
-    ("rate\nHz", "right"),
-    ("last state\nms ago", "right"),
-    ("weights", "left"),
-    ("deadline\nmisses", "right"),
-    ("fallbacks\nplan/brake/stop", "right"),
-    ("delay\nms", "right"),
-    ("messages\nrefused/lost/stale", "right"),
+_VALUES: Final = (
+    "state",
+    "rate Hz",
+    "last state ms ago",
+    "weights",
+    "deadline misses",
+    "fallbacks plan/brake/stop",
+    "delay ms",
+    "messages refused/lost/stale",
 )
-"""Shown of each process: columns of the wide table, rows of the narrow ones."""
-
-_WIDE: Final = 115
-"""Columns of a terminal that the wide table fits into, if names are short."""
+"""Shown of each process, in the order of :func:`_values`."""
 
 _COLOURS: Final = {
     "driving": "green", "running": "green", "fallback": "red", "stopped": "yellow",
@@ -81,11 +77,11 @@ def show_status(
             with Live(console=Terminal(), auto_refresh=False) as live:
                 for car in follow(session, found, name, _PERIOD_S):
                     if car is None:  # once a period, not for each heartbeat
-                        live.update(StatusTable(found, brief=True), refresh=True)
+                        live.update(status_table(found, brief=True), refresh=True)
         elif as_json:
             _print_json(found)
         else:
-            Terminal().print(StatusTable(found))
+            Terminal().print(status_table(found))
     if not watch and not found.answering:
         raise InputError(
             f"no answer within {timeout_s:g} s from the processes found; they hang or are of "
@@ -109,54 +105,29 @@ def _closed_pipe_allowed() -> Iterator[None]:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-class StatusTable:
-    """The network for rich to print: a row per process, or a table per car where that is too wide.
-
-    ``brief`` cuts each message to a line.
-    """
-
-    def __init__(self, network: NetworkStatus, *, brief: bool = False) -> None:
-        self._cars: dict[str, list[tuple[str, ProcessStatus]]] = {
-            car: [(source, processes[source]) for source in SOURCES if source in processes]
-            for car, processes in network.cars.items()
-        }
-        self._brief = brief
-
-    def __rich_console__(
-        self, console: Console, options: ConsoleOptions
-    ) -> Iterator[RenderableType]:
-        if not self._cars:
-            yield "no process is present any more"
-        elif options.max_width >= _WIDE:
-            yield self._wide()
-            yield ""
-        else:
-            for car, processes in self._cars.items():
-                yield _narrow(car, processes)
-                yield ""
-        for car, processes in self._cars.items():
-            for source, process in processes:
-                text = _message(f"{car} {source}", process)
-                text.no_wrap, text.overflow = self._brief, "ellipsis" if self._brief else "fold"
-                yield text
-
-    def _wide(self) -> Table:
-        table = plain_table("car", "process", *(title for title, _ in _VALUES), left=2)
-        for column, (_, justify) in zip(table.columns[2:], _VALUES, strict=True):
-            column.justify, column.no_wrap = justify, justify == "right"
-        for car, processes in self._cars.items():
-            for source, process in processes:
-                table.add_row(printable(car), source, *_values(source, process))
-        return table
-
-
-def _narrow(car: str, processes: list[tuple[str, ProcessStatus]]) -> Table:
-    sources = [source for source, _ in processes]
-    table = plain_table(printable(car), *sources, left=1 + len(sources))
-    columns = [_values(source, process) for source, process in processes]
-    for (title, _), *values in zip(_VALUES, *columns, strict=True):
-        table.add_row(title.replace("\n", " "), *values)
-    return table
+def status_table(network: NetworkStatus, *, brief: bool = False) -> Group:
+    """A table for each car with a column for each process, and the latest messages, for rich to
+    print; ``brief`` cuts each message to a line."""
+    cars = {
+        car: [(source, processes[source]) for source in SOURCES if source in processes]
+        for car, processes in network.cars.items()
+    }
+    if not cars:
+        return Group("no process is present any more")
+    shown: list[RenderableType] = []
+    for car, processes in cars.items():
+        sources = [source for source, _ in processes]
+        table = plain_table(printable(car), *sources, left=1 + len(sources))
+        columns = [_values(source, process) for source, process in processes]
+        for title, *values in zip(_VALUES, *columns, strict=True):
+            table.add_row(title, *values)
+        shown += [table, ""]
+    for car, processes in cars.items():
+        for source, process in processes:
+            text = _message(f"{car} {source}", process)
+            text.no_wrap, text.overflow = brief, "ellipsis" if brief else "fold"
+            shown.append(text)
+    return Group(*shown)
 
 
 def _values(source: str, process: ProcessStatus) -> list[Text | str]:
