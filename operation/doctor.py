@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import Final, NamedTuple
 
-from bayesrace.configuration import Configuration
+from bayesrace.configuration import Configuration, TlsSettings
 from bayesrace.errors import InputError
 from bayesrace.messages import Role
 from bayesrace.operation.lifecycle import SOURCES, find
@@ -106,7 +106,8 @@ def examine(configuration: Configuration) -> Iterator[Check]:
     own = _chosen(certificates)
     if certificates and own is None:
         return
-    endpoints = _everyone(configuration, own)
+    plain = configuration.model_copy(update={"tls": TlsSettings()}).endpoints("viewer")
+    endpoints = plain.model_copy(update={"credentials": own})
     try:
         endpoints.check()
     except InputError as error:
@@ -136,17 +137,6 @@ def _chosen(certificates: list[Credentials]) -> Credentials | None:
     """The one to try the links with: that which may do most."""
     by_role = {one.member.role: one for one in certificates if one.member is not None}
     return next((by_role[role] for role in _ROLES if role in by_role), None)
-
-
-def _everyone(configuration: Configuration, own: Credentials | None) -> Endpoints:
-    network = configuration.network
-    return Endpoints(
-        connect=network.everyone,
-        credentials=own,
-        insecure=network.insecure,
-        limits=configuration.limits,
-        zenoh=configuration.zenoh,
-    )
 
 
 def _cars(endpoints: Endpoints, own: Credentials | None) -> Iterator[Check]:

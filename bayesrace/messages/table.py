@@ -177,6 +177,7 @@ EVERYTHING: Final = "bayesrace/{car}/**"
 """What a recorder subscribes to; it receives what its role may read."""
 RECORDERS: Final[tuple[Role, ...]] = ("director", "viewer")
 """Who may."""
+
 _BY_PREFIX: Final = {topic.key.split("/")[2]: topic for topic in TOPICS}
 
 
