@@ -119,16 +119,6 @@ def test_where_drawing_fails_the_report_before_stays(
     assert {file.name: file.stat().st_mtime_ns for file in path.iterdir()} == before
 
 
-def test_a_race_that_was_cut_off_still_gets_its_page(tmp_path: Path) -> None:
-    path = race(tmp_path)
-    data = (path / "run.mcap").read_bytes()
-    (path / "run.mcap").write_bytes(data[: int(0.3 * len(data))])
-    page = write_report(path)
-    text = page.read_text(encoding="utf-8")
-    assert "The log is not complete" in text
-    assert "DNF" in text
-
-
 @pytest.mark.parametrize(
     ("share", "junk", "shown"), [(1.0, b"", True), (0.5, b"", True), (0.0, b"no log", False)]
 )
