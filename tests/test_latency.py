@@ -1,19 +1,26 @@
-"""The latency report: every leg from the log, the bare loop, counting."""
+"""Latency: every leg from the log, clocks of several hosts, counting, the bare loop, the report."""
 
+import io
+import json
 import random
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from hdrh.log import HistogramLogReader
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from rich.console import Console
 
 from bayesrace.errors import InputError
-from bayesrace.studies.latency.analysis import Beside, analyse
+from bayesrace.studies.latency.analysis import Analysis, Beside, analyse
 from bayesrace.studies.latency.beside import bare_loop, bare_result
-from bayesrace.studies.latency.legs import ANSWER, LEGS
-from bayesrace.studies.latency.results import Series, new_histogram
+from bayesrace.studies.latency.legs import ANSWER, BESIDE, LEGS, ClockMap
+from bayesrace.studies.latency.report import print_report, write_files
+from bayesrace.studies.latency.results import Memory, Series, new_histogram
 from bayesrace.studies.latency.settings import LatencySettings
+from bayesrace.transport import Endpoints
 from tests.synthetic_latency import PERIOD_NS, Loop, report_of
 
 
@@ -306,3 +313,145 @@ def test_bare_loop_counts_as_the_controller_does() -> None:
     assert result.mean_period_us == pytest.approx(20_000 * 289 / 286)
     assert series.at_s[-1] == pytest.approx(289 * 0.02)
     assert result.refused == ["no priority"]
+
+
+# Clocks -------------------------------------------------------------------------------------------
+
+
+delays = st.one_of(st.integers(0, 500_000), st.integers(0, 80_000_000))
+
+
+@settings(deadline=None, max_examples=60)
+@given(
+    offset_ns=st.integers(-(10**14), 10**14),
+    drift_ppm=st.floats(-150, 150),
+    ways=st.lists(st.tuples(delays, delays), min_size=2, max_size=60),
+    share=st.floats(0, 1),
+)
+def test_true_offset_is_within_the_stated_uncertainty(
+    offset_ns: int, drift_ppm: float, ways: list[tuple[int, int]], share: float
+) -> None:
+    """However unequal the two ways are, at the exchanges and between them."""
+
+    def controller(plant_ns: int) -> int:
+        return plant_ns + offset_ns + round(plant_ns * drift_ppm * 1e-6)
+
+    exchanges = []
+    for k, (there_ns, back_ns) in enumerate(ways):
+        sampled = 10**15 + k * 333_000_000
+        received = sampled + there_ns
+        sent = received + 400_000
+        exchanges.append((sampled, controller(received), controller(sent), sent + back_ns))
+    columns = np.array(exchanges, dtype=float).T
+    clock = ClockMap.of(*columns)
+    assert clock is not None
+    first, last = min(columns[1]), max(columns[1])
+    reading = int(first + share * (last - first))
+    plant = int(clock.to_plant(np.array([reading], dtype=float))[0])
+    if not clock.shared:
+        assert abs(controller(plant) - reading) <= clock.uncertainty
+
+
+def test_the_shortest_exchange_bounds_the_offset() -> None:
+    """Of three within half a second, 120 us against two slow ones."""
+    ways = np.array([9e5, 4e4, 3e6])
+    sampled = np.linspace(0.0, 4e8, 3)
+    received = sampled + ways + 5_000_000_000
+    clock = ClockMap.of(sampled, received, received, sampled + 4 * ways)
+    assert clock is not None
+    assert not clock.shared
+    assert clock.offset.tolist() == pytest.approx([5_000_000_000], abs=80_002)
+    # A fifth of a second away, the clocks may have run apart by 40 us more.
+    assert clock.uncertainty == pytest.approx(80_000 + 40_000, abs=1000)
+
+
+def test_one_clock_needs_no_correction(tmp_path: Path) -> None:
+    with Loop(tmp_path / "run.mcap", ahead_ns=0) as system:
+        for _ in range(50):
+            system.cycle()
+    clocks = report_of(tmp_path / "run.mcap").result.clocks
+    assert clocks is not None
+    assert (clocks.shared, clocks.uncertainty_us, clocks.offset_us) == (True, 0, 0)
+    assert clocks.exchanges == 49
+
+
+@pytest.mark.parametrize("ahead_ns", [10**12, -(10**12), 9_000_000, -2_000_000])
+def test_other_clocks_are_corrected_within_the_uncertainty(tmp_path: Path, ahead_ns: int) -> None:
+    """The transports, 600 and 400 us, are known within half of their sum."""
+    with Loop(tmp_path / "run.mcap", ahead_ns=ahead_ns, drift=75e-6) as system:
+        for _ in range(200):
+            system.cycle()
+    result = report_of(tmp_path / "run.mcap").result
+    clocks, legs = result.clocks, result.legs_us
+    assert clocks is not None
+    assert not clocks.shared
+    end_us = (ahead_ns + 75e-6 * 200 * PERIOD_NS) * 1e-3
+    assert abs(clocks.offset_us - end_us) <= clocks.uncertainty_us == pytest.approx(500, abs=1)
+    for name, true_us in (("state_transport", 600), ("actuation_transport", 400)):
+        assert legs[name].uncertainty_us == clocks.uncertainty_us
+        assert abs(legs[name].min - true_us) <= clocks.uncertainty_us
+        assert abs(legs[name].max - true_us) <= clocks.uncertainty_us
+    assert legs[ANSWER].uncertainty_us == 0
+
+
+# Report -------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def analysis(tmp_path: Path) -> Analysis:
+    """A run with two clocks, a lost message and everything that can be measured."""
+    with Loop(tmp_path / "run.mcap", state_seq=100_000) as system:
+        for k in range(200):
+            system.cycle()
+            if k % 5 == 4:
+                system.heartbeats(lost=5 if k > 100 else 0)
+    settings = LatencySettings(
+        log=tmp_path / "run.mcap",
+        warm_up_s=0.0,
+        track="",
+        load=2,
+        attach=Endpoints(connect=("tcp/pit:1",)),
+    )
+    late_ns = np.full(250, 80_000)
+    late_ns[9] = PERIOD_NS + 1
+    rss = {"plant": Memory(begin_bytes=2**26, most_bytes=2**26 + 4096)}
+    bare = bare_result(late_ns, PERIOD_NS, [])
+    passed = Series(np.linspace(0.0, 4.98, 250), np.full(250, 300_000.0))
+    beside = Beside("pit", bare, passed, rss, ["ended early: the sun went down"])
+    return analyse(tmp_path / "run.mcap", settings, None, beside)
+
+
+def test_table_fits_a_terminal_of_80_columns_and_says_everything(analysis: Analysis) -> None:
+    out = io.StringIO()
+    changes = {"off_track_samples": 6, "deadline_misses": 3, "late_states": 2}
+    result = analysis.result.model_copy(update=changes)
+    print_report(result, Console(file=out, width=80))
+    text = out.getvalue()
+    assert all(title in text for title, _ in LEGS.values())
+    assert "…" not in text
+    for words in (
+        "3 deadlines missed (bare loop 1)", "190 sent = 190 received + 0 lost",
+        "185 received + 0 lost +5 NOT ACCOUNTED FOR", "off track 6 of 200", "± 500 us", "laps 1",
+        "7.000100 s ahead of the plant's", "the sun went down", "+0.0000%", "attached", "load 2",
+        "on this machine, pit", "4 kB on 64.0 MB", "0 repeated answers, 2 late states",
+        *BESIDE.values(),
+    ):  # fmt: skip
+        assert words in " ".join(text.split()), words
+
+
+@pytest.mark.parametrize("measured", [True, False])
+def test_files_are_made_of_whatever_was_measured(
+    analysis: Analysis, tmp_path: Path, measured: bool
+) -> None:
+    write_files(tmp_path, analysis if measured else replace(analysis, series={}))
+    assert (tmp_path / "latency.png").read_bytes().startswith(b"\x89PNG")
+    logs = {path.stem for path in tmp_path.glob("*.hlog")}
+    assert logs == ({*LEGS, *BESIDE} if measured else set())
+    content = json.loads((tmp_path / "latency.json").read_text())
+    assert content == json.loads(analysis.result.model_dump_json())
+    promised = {
+        "state_to_actuation_us", "deadline_misses", "bare_loop_misses", "ticks", "sent",
+        "received", "lost", "rss_growth_bytes", "repeated_answers", "late_states",
+    }  # fmt: skip
+    assert promised <= set(content)
+    assert {"p50", "p90", "p99", "p999", "max"} <= set(content["state_to_actuation_us"])
