@@ -335,13 +335,3 @@ def test_a_plant_with_another_period_is_said_once_and_noted(tmp_path: Path, jobs
     print_laps(record, console)
     text = console.export_text()
     assert [text.count(remark) for remark in record.remarks] == [1, 1]
-
-
-def test_weights_files_stay_bounded(
-    tmp_path: Path, jobs: Jobs, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(journal, "MOST_WEIGHTS", 2)
-    for run in range(1, 5):
-        jobs.run(tmp_path, *lap_of(FIRST, run))
-    names = {path.name for path in tmp_path.glob("weights-*.bin")}
-    assert names == {"weights-0002.bin", "weights-0003.bin"}

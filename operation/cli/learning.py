@@ -206,7 +206,7 @@ def rollback(
 
 @options_of(
     "bayesrace.operation.learn.records.LearnSettings",
-    "laps points keep track compare seed car name",
+    "laps points keep track seed car name",
 )
 def learn(
     learning: "Endpoints",

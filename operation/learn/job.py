@@ -25,7 +25,7 @@ from bayesrace.operation.learn.collector import Collector, Stretch
 from bayesrace.operation.learn.journal import Journal, resumable_settings
 from bayesrace.operation.learn.publishing import Publisher
 from bayesrace.operation.learn.records import LapRecord, LearnSettings, Record, UpdateRecord
-from bayesrace.operation.learn.report import References, draw, references
+from bayesrace.operation.learn.report import draw
 from bayesrace.processes import deferred_interrupt
 from bayesrace.tracks import Track, load_track
 from bayesrace.transport import NEWEST, Endpoints, Inbox, Item, Kind, open_session
@@ -54,7 +54,6 @@ def learn(
     """
     car, before = settings.car, resumable_settings(folder)
     track = None if settings.track is None else load_track(settings.track, car.width_m)
-    beside = references(settings.compare)
     unread = [name for name, one in (("--data", data), ("--weights", weights)) if one]
     if before is not None:
         data, weights = (), None
@@ -83,8 +82,8 @@ def learn(
         if samples is not None and not journal.resumed:
             journal.add_driven(samples)
         with open_session(endpoints, "learning") as session:
-            Learner(session, journal, say, track, beside).run()
-        draw(journal.record, beside, folder / "laps.png")
+            Learner(session, journal, say, track).run()
+        draw(journal.record, folder / "laps.png")
         return journal.record
 
 
@@ -92,16 +91,11 @@ class Learner:
     """One job: :meth:`run` it once, in the main thread."""
 
     def __init__(
-        self,
-        session: Any,
-        journal: Journal,
-        say: Callable[[str], None],
-        track: Track | None,
-        beside: References,
+        self, session: Any, journal: Journal, say: Callable[[str], None], track: Track | None
     ) -> None:
-        """``say``: prints a line; ``track``: times laps; ``beside``: drawn for comparison."""
+        """``say``: prints a line; ``track``: times laps."""
         settings = self._settings = journal.settings
-        self._journal, self._say, self._beside = journal, say, beside
+        self._journal, self._say = journal, say
         self._collector = Collector(settings.car, settings.discretisation.step_s, track)
         self._publisher = Publisher(session, journal, say)
         self._trainer = Trainer()
@@ -212,7 +206,7 @@ class Learner:
         )
         self._journal.add_update(update, outcome.weights, outcome.kept)
         self._journal.drop_weights(self._publisher.in_use)
-        draw(self._journal.record, self._beside, self._journal.folder / "laps.png")
+        draw(self._journal.record, self._journal.folder / "laps.png")
         if failed:
             self._say(f"nothing learned after lap {update.after_lap}: {update.answer}")
             return

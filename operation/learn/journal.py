@@ -111,9 +111,8 @@ class Journal:
         if samples is not None:
             self._new = _joined(self._new, samples)
             self._unlearned |= len(samples) > 0
-            self._save_samples()
         if samples is not None or lap is not None:
-            self.save()
+            self.save(samples=samples is not None)
 
     def take_samples(self) -> Dataset | None:
         """For a training: all samples; None if none of them is new."""
@@ -140,8 +139,7 @@ class Journal:
         if kept is not None:
             update.kept = len(kept)
             self._learning, self._unlearned = kept, len(self._new) > 0
-            self._save_samples()
-        self.save()
+        self.save(samples=kept is not None)
 
     def remark(self, text: str) -> bool:
         """Notes why a drive gave nothing to learn from; False if that is noted already."""
@@ -163,23 +161,16 @@ class Journal:
             if path.name not in names:
                 path.unlink()
 
-    def save(self) -> None:
-        """Writes the record."""
+    def save(self, samples: bool = False) -> None:
+        """Writes the record; ``samples``: and these before it."""
         try:
+            if samples:
+                with replacing(self.folder / _SAMPLES) as path:
+                    write_npz(path, concatenate([self._learning, self._new]))
             write_whole(self.folder / _RECORD, self.record.model_dump_json(indent=1) + "\n")
         except OSError as error:
-            raise self._unwritable(error) from None
-
-    def _save_samples(self) -> None:
-        try:
-            with replacing(self.folder / _SAMPLES) as path:
-                write_npz(path, concatenate([self._learning, self._new]))
-        except OSError as error:
-            raise self._unwritable(error) from None
-
-    def _unwritable(self, error: OSError) -> InputError:
-        why = f"cannot write in {self.folder}: {error.strerror or error}"
-        return InputError(f"{why}; the job can be resumed")
+            why = f"cannot write in {self.folder}: {error.strerror or error}"
+            raise InputError(f"{why}; the job can be resumed") from None
 
 
 def resumable_settings(folder: Path) -> LearnSettings | None:

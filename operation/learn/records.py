@@ -1,12 +1,10 @@
 """Settings and records of a learning job; ``laps.json`` holds its :class:`Record`."""
 
 from collections.abc import Mapping
-from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from bayesrace.defaults import Option
 from bayesrace.integrators import PREDICTION, Discretisation
 from bayesrace.vehicles import CarSetting, default_car
 
@@ -35,9 +33,6 @@ class LearnSettings(BaseModel):
     laps: int | None = Field(None, ge=1, description="end after so many laps")
     track: str | None = Field(
         None, description="track that is driven, for exact lap times and excursions"
-    )
-    compare: Annotated[Path | None, Option(metavar="DIR")] = Field(
-        None, description="run directory of a race whose lap times are drawn, too"
     )
     seed: int = Field(0, ge=0, le=2**32 - 1, description="seed of the optimiser's starts")
 

@@ -1,6 +1,5 @@
 """Shows the record of a learning job: a table on the terminal, and lap time against lap number."""
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
@@ -10,15 +9,11 @@ from matplotlib.ticker import MaxNLocator
 from rich.console import Console
 from rich.text import Text
 
-from bayesrace.operation.analysis.results import read_result
 from bayesrace.operation.learn.records import LapRecord, Record, UpdateRecord
 from bayesrace.operation.report.style import INK, MUTED, WARNING, figure_style, look, write_png
 from bayesrace.operation.terminal.terminal import Terminal, plain_table
 
-__all__ = ["References", "draw", "print_laps", "references"]
-
-References = Mapping[str, float]
-"""Controller to flying lap time [s], drawn for comparison."""
+__all__ = ["draw", "print_laps"]
 
 _MOST_ROWS: Final = 40
 
@@ -60,13 +55,7 @@ def _cells(update: UpdateRecord | None) -> list[str]:
     return [*learned, update.version, update.verdict + cycle]
 
 
-def references(race: Path | None) -> References:
-    """Flying lap times of a race, from its run directory; InputError if it is none."""
-    laps = [] if race is None else read_result(race / "result.json").laps
-    return {lap.controller: lap.flying_lap_time_s for lap in laps if lap.flying_lap_time_s}
-
-
-def draw(record: Record, beside: References, path: Path) -> None:
+def draw(record: Record, path: Path) -> None:
     """Writes the figure (PNG), whole or not at all; none without a timed lap.
 
     A line joins flying laps; the weights are at the lower edge, between the laps. A lap that takes
@@ -78,7 +67,7 @@ def draw(record: Record, beside: References, path: Path) -> None:
     number, time_s = np.array([(lap.lap, lap.time_s) for lap in laps]).T
     flying = np.array([lap.flying for lap in laps])
     off_track = np.array([bool(lap.off_track_m) for lap in laps])
-    shown = np.array([*(time_s[flying] if flying.any() else time_s[:1]), *beside.values()])
+    shown = time_s[flying] if flying.any() else time_s[:1]
     usual = shown[shown <= 1.25 * np.median(shown)]
     top = usual.max() + max(0.3 * np.ptp(usual), 0.006 * usual.max())
     with figure_style():
@@ -110,9 +99,6 @@ def draw(record: Record, beside: References, path: Path) -> None:
                 at, [0.0] * len(at), marker, markersize=8, color=colour, clip_on=False,
                 transform=axes.get_xaxis_transform(), label=label if at else None,
             )  # fmt: skip
-        for controller, lap_s in beside.items():
-            style, label = look(controller), f"{look(controller).name} {lap_s:.3f} s"
-            axes.axhline(lap_s, color=style.colour, linewidth=1, linestyle="--", label=label)
         axes.xaxis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))
         axes.ticklabel_format(axis="y", useOffset=False)
         axes.set_xlim(0.4, len(record.laps) + 0.6)
