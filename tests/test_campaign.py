@@ -214,7 +214,7 @@ def test_a_case_whose_workers_die_is_a_failed_row_and_reported(tmp_path: Path) -
     from bayesrace.operation.settings import RaceSettings
     from bayesrace.studies.campaign.campaign import CampaignError, rows_of
     from bayesrace.studies.campaign.case import Case
-    from bayesrace.studies.campaign.page import render_campaign
+    from bayesrace.studies.campaign.report import render_campaign
     from bayesrace.studies.campaign.results import writing
 
     class Lost:

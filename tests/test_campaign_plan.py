@@ -16,8 +16,7 @@ from bayesrace.operation.preparation import updated_weights
 from bayesrace.operation.race import race
 from bayesrace.operation.settings import RaceSettings
 from bayesrace.operation.terminal.terminal import stages_on
-from bayesrace.studies.campaign.case import Case, factors
-from bayesrace.studies.campaign.execute import FAILED, run_case
+from bayesrace.studies.campaign.case import FAILED, Case, factors, run_case
 from bayesrace.studies.campaign.plan import Campaign, read_plan
 from bayesrace.vehicles import CarParameters, write_car
 from bayesrace.vehicles.parts import PacejkaTyres

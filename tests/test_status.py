@@ -7,11 +7,10 @@ import subprocess
 import sys
 
 import pytest
-from bayesrace.operation.analysis.network_status import NetworkStatus, ProcessStatus
 from rich.console import Console
 
 from bayesrace.errors import InputError
-from bayesrace.operation.lifecycle import follow
+from bayesrace.operation.lifecycle import NetworkStatus, ProcessStatus, follow
 from bayesrace.operation.terminal.status_table import status_table
 from bayesrace.transport import Endpoints, free_endpoint, open_session
 from tests import sample_messages as messages

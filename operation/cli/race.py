@@ -230,8 +230,8 @@ def campaign(
     """
     from bayesrace.operation.terminal.terminal import Terminal
     from bayesrace.studies.campaign.campaign import run_campaign
-    from bayesrace.studies.campaign.page import render_campaign
     from bayesrace.studies.campaign.plan import read_plan
+    from bayesrace.studies.campaign.report import render_campaign
 
     read = read_plan(plan)
     folder = out or Path("runs") / plan.stem
@@ -245,7 +245,7 @@ def campaign_report(
     folder: Path = options.argument("DIR", "Folder of a campaign's results."),
 ) -> None:
     """Make the report of a campaign again from its Parquet files."""
-    from bayesrace.studies.campaign.page import render_campaign
+    from bayesrace.studies.campaign.report import render_campaign
 
     typer.echo(str(render_campaign(folder)))
 

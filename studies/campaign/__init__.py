@@ -1,8 +1,8 @@
 """``bayesrace campaign``: thousands of laps over a grid or a sample of settings, by Dask.
 
 In the order of use: ``plan`` reads the TOML file and makes its ``case``s, each with a key that
-changes with everything that shapes its result. ``execute`` drives one case, on a worker.
-``campaign`` starts workers or finds them, and hands them the cases that ``results`` does not hold
-yet. ``results`` keeps one row a lap in Parquet. ``summary`` makes one table of all rows and
-summaries of it, which ``page`` shows. ``tune`` searches for better settings by the same workers.
+changes with everything that shapes its result; a worker drives it. ``campaign`` starts workers or
+finds them, and hands them the cases that ``results`` does not hold yet. ``results`` keeps one row a
+lap in Parquet, of which ``report`` makes tables and a page. ``tune`` searches for better settings
+by the same workers.
 """

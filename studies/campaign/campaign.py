@@ -24,8 +24,15 @@ from rich.console import Console
 from bayesrace.errors import InputError
 from bayesrace.files import write_whole
 from bayesrace.processes import raise_if_interrupted
-from bayesrace.studies.campaign.case import Case, Files, car_identity, software_identity
-from bayesrace.studies.campaign.execute import FAILED, Row, run_case
+from bayesrace.studies.campaign.case import (
+    FAILED,
+    Case,
+    Files,
+    Row,
+    car_identity,
+    run_case,
+    software_identity,
+)
 from bayesrace.studies.campaign.plan import Campaign
 from bayesrace.studies.campaign.results import writing
 from bayesrace.vehicles import write_car

@@ -122,8 +122,8 @@ class _Reader:
         grid = {n: self._values("grid", n, v) for n, v in _leaves("grid", plan.grid).items()}
         drawn = {n: self._drawn(n, v) for n, v in _leaves("random", plan.random).items()}
         count = math.prod(map(len, grid.values())) * plan.draws
-        if faults := _faults(plan, list(grid), list(drawn), count):
-            raise InputError(faults[0])
+        for fault in _faults(plan, list(grid), list(drawn), count):
+            raise InputError(fault)
         # In the order in which they learn from each other.
         controllers, cases = tuple(one for one in CONTROLLERS if one in plan.controllers), {}
         for values in self._points(grid, drawn):
@@ -209,26 +209,25 @@ class _Reader:
         return name
 
 
-def _faults(plan: _Plan, grid: list[str], drawn: list[str], count: int) -> list[str]:
+def _faults(plan: _Plan, grid: list[str], drawn: list[str], count: int) -> Iterator[str]:
     """What is wrong with the plan as a whole: names of its settings, and its number of cases."""
-    faults = []
     for one in (one for one in plan.controllers if one in LEARNS_FROM):
         missing = [other for other in LEARNS_FROM[one] if other not in plan.controllers]
         if plan.weights is not None:
-            faults.append(f"controllers: '{one}' trains anew; leave it or the weights out")
+            yield f"controllers: '{one}' trains anew; leave it or the weights out"
         elif missing:
-            faults.append(f"controllers: '{one}' learns from the laps of '{missing[0]}'; add that")
-    faults += [f"{one} is in [grid] and in [random]; leave it in one" for one in {*grid} & {*drawn}]
+            yield f"controllers: '{one}' learns from the laps of '{missing[0]}'; add that"
+    for name in {*grid} & {*drawn}:
+        yield f"{name} is in [grid] and in [random]; leave it in one"
     if not drawn and plan.draws > 1:
-        faults.append(f"draws = {plan.draws}: there is nothing to draw; add [random]")
-    if plan.weights is not None:
-        idle = [name for name in (*grid, *drawn) if name.split(".")[0] in _TRAINING]
-        faults += [f"{one} shapes what is learned; leave it or the weights out" for one in idle]
+        yield f"draws = {plan.draws}: there is nothing to draw; add [random]"
+    for name in (*grid, *drawn):
+        if plan.weights is not None and name.split(".")[0] in _TRAINING:
+            yield f"{name} shapes what is learned; leave it or the weights out"
     if not grid and not drawn:
-        faults.append("the plan names no races; give tracks in [grid] (docs/campaigns.md)")
+        yield "the plan names no races; give tracks in [grid] (docs/campaigns.md)"
     if count > _MOST_CASES:
-        faults.append(f"{count} cases, at most {_MOST_CASES} are possible; draw some in [random]")
-    return faults
+        yield f"{count} cases, at most {_MOST_CASES} are possible; draw some in [random]"
 
 
 def _leaves(table: str, given: Mapping[str, Any], before: str = "") -> dict[str, Any]:

@@ -20,8 +20,7 @@ from pydantic.fields import FieldInfo
 
 from bayesrace.errors import InputError
 from bayesrace.files import clear_partials, replacing
-from bayesrace.studies.campaign.case import factors
-from bayesrace.studies.campaign.execute import FAILED, Row
+from bayesrace.studies.campaign.case import FAILED, Row, factors
 
 __all__ = ["Results", "read_results", "writing"]
 

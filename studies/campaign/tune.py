@@ -23,8 +23,7 @@ from bayesrace.operation.preparation import prepare
 from bayesrace.operation.settings import RaceSettings
 from bayesrace.operation.terminal.terminal import Stages, plain_table
 from bayesrace.studies.campaign.campaign import computed, connected
-from bayesrace.studies.campaign.case import Case, Controller, Files
-from bayesrace.studies.campaign.execute import FAILED, Row
+from bayesrace.studies.campaign.case import FAILED, Case, Controller, Files, Row
 from bayesrace.studies.settings import TuneSettings
 from bayesrace.vehicles import CarParameters, write_car
 
