@@ -3,11 +3,12 @@
 In the order of use:
 
 1. :mod:`.sources` reads one-step samples from run logs and plain arrays; :mod:`.dataset` holds
-   and filters them, and computes what the nominal model misses.
+   and filters them.
 2. :mod:`.gaussian_process` predicts with a GP, and finds its hyperparameters.
 3. :mod:`.subset` chooses the samples that a GP keeps, and those that cross-validation leaves out.
    :mod:`.target` is one output to learn, and scores predictions of it.
 4. :mod:`.training` puts these together; :mod:`.trainer` does so lap by lap, in another process.
-5. :mod:`.validation` compares weights with another drive.
+5. :mod:`.validation` computes what the nominal model misses, and compares weights with another
+   drive.
 6. :mod:`.search` is apart: it finds the minimum of a costly function, such as a lap by its line.
 """

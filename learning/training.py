@@ -37,7 +37,7 @@ from bayesrace.arrays import Floats, Rows
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import FEATURES, OUTPUTS, GpOutput, GpWeights, encode_weights
 from bayesrace.integrators import Discretisation
-from bayesrace.learning.dataset import Dataset, identity, left_out, residual
+from bayesrace.learning.dataset import Dataset, left_out
 from bayesrace.learning.gaussian_process import (
     Fit,
     PairDistances,
@@ -49,6 +49,7 @@ from bayesrace.learning.gaussian_process import (
 from bayesrace.learning.settings import MIN_SAMPLES, Progress, TrainingSettings
 from bayesrace.learning.subset import evenly, most_informative, spans, stretches
 from bayesrace.learning.target import KernelScore, Target
+from bayesrace.learning.validation import identity, residual
 
 __all__ = ["MAX_SAMPLES", "Training", "fit", "train"]
 

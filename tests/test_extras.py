@@ -51,7 +51,7 @@ def test_the_controller_drives_with_its_own_extra_alone(
 @pytest.mark.parametrize(
     ("modules", "package", "command", "extra"),
     [
-        ("studies.campaign.page studies.campaign.summary studies.campaign.results", "pandas",
+        ("studies.campaign.report studies.campaign.results", "pandas",
          "campaign-report .", "campaign"),
         ("operation.certificates", "cryptography", "certs init", "certificates"),
         ("plant.fmu", "fmpy", "fmu inspect FMU", "fmu"),

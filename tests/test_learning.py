@@ -10,14 +10,7 @@ from bayesrace.errors import InputError
 from bayesrace.gp.expression import evaluate_mean
 from bayesrace.gp.weights import FEATURES, KERNELS, OUTPUTS, zero_weights
 from bayesrace.integrators import PREDICTION, Discretisation
-from bayesrace.learning.dataset import (
-    ROUNDING,
-    Dataset,
-    concatenate,
-    filter_dataset,
-    identity,
-    residual,
-)
+from bayesrace.learning.dataset import ROUNDING, Dataset, concatenate, filter_dataset
 from bayesrace.learning.gaussian_process import (
     Covariance,
     PairDistances,
@@ -28,7 +21,7 @@ from bayesrace.learning.gaussian_process import (
 from bayesrace.learning.settings import TrainingSettings
 from bayesrace.learning.subset import most_informative
 from bayesrace.learning.training import train
-from bayesrace.learning.validation import predictive_sigma, validate
+from bayesrace.learning.validation import identity, predictive_sigma, residual, validate
 from bayesrace.vehicles.models import dynamic, e_kinematic
 from tests.conftest import discrete
 from tests.driven import CAR, QUICK, STEP_S, dataset_of, drive, logged, telemetry

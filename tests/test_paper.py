@@ -12,8 +12,8 @@ from rich.progress import TaskID
 
 from bayesrace.errors import InputError
 from bayesrace.integrators import PREDICTION
-from bayesrace.learning.dataset import residual
 from bayesrace.learning.gaussian_process import PairDistances, maximise, starts
+from bayesrace.learning.validation import residual
 from bayesrace.operation.settings import RaceSettings
 from bayesrace.operation.terminal.terminal import Stage, stages_on
 from bayesrace.studies.paper import make

@@ -14,11 +14,12 @@ import pytest
 from bayesrace.gp.expression import evaluate_mean
 from bayesrace.gp.weights import GpWeights, write_weights, zero_weights
 from bayesrace.integrators import PREDICTION
-from bayesrace.learning.dataset import Dataset, concatenate, recalled, residual
+from bayesrace.learning.dataset import Dataset, concatenate
 from bayesrace.learning.settings import TrainingSettings
 from bayesrace.learning.subset import MOST_NEW, bounded
 from bayesrace.learning.trainer import NICE, Outcome, Trainer, perform
 from bayesrace.learning.training import train
+from bayesrace.learning.validation import recalled, residual
 from bayesrace.vehicles.models import dynamic
 from tests.driven import CAR, QUICK, drive
 from tests.programs import until

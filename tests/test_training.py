@@ -16,7 +16,7 @@ from bayesrace.errors import InputError
 from bayesrace.gp.expression import evaluate_mean
 from bayesrace.gp.weights import KERNELS, OUTPUTS, decode_weights, encode_weights
 from bayesrace.integrators import PREDICTION, Discretisation
-from bayesrace.learning.dataset import Dataset, concatenate, discretisation_of, identity, residual
+from bayesrace.learning.dataset import Dataset, concatenate
 from bayesrace.learning.gaussian_process import (
     BOUNDS,
     Covariance,
@@ -29,7 +29,13 @@ from bayesrace.learning.gaussian_process import (
 from bayesrace.learning.subset import stretches
 from bayesrace.learning.target import PredictionErrors, Target
 from bayesrace.learning.training import MAX_SAMPLES, Training, fit, train
-from bayesrace.learning.validation import predictive_sigma, validate
+from bayesrace.learning.validation import (
+    discretisation_of,
+    identity,
+    predictive_sigma,
+    residual,
+    validate,
+)
 from bayesrace.vehicles.models import dynamic, e_kinematic
 from tests.driven import CAR, QUICK, STEP_S, drive
 from tests.scikit import correlation

@@ -12,8 +12,8 @@ from bayesrace.controller.pure_pursuit import PurePursuit, PurePursuitSettings
 from bayesrace.controller.python_controller import PythonController
 from bayesrace.gp.weights import zero_weights
 from bayesrace.integrators import PREDICTION
-from bayesrace.learning.dataset import identity
 from bayesrace.learning.sources import dataset_from_log
+from bayesrace.learning.validation import identity
 from bayesrace.log import LogReader, LogWriter
 from bayesrace.messages import STATE, TRUTH, State, Truth
 from bayesrace.operation.analysis.race import analyse, read_race

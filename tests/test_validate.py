@@ -13,10 +13,10 @@ from bayesrace.errors import InputError
 from bayesrace.gp.expression import corrected_function
 from bayesrace.gp.weights import OUTPUTS, GpWeights, read_weights, write_weights, zero_weights
 from bayesrace.integrators import PREDICTION, Discretisation
-from bayesrace.learning.dataset import Dataset, concatenate, identity
+from bayesrace.learning.dataset import Dataset, concatenate
 from bayesrace.learning.sources import write_npz
 from bayesrace.learning.training import train
-from bayesrace.learning.validation import mismatch, unbroken, validate
+from bayesrace.learning.validation import identity, mismatch, unbroken, validate
 from bayesrace.operation.analysis.validation import ValidationResult, validate_weights
 from bayesrace.operation.terminal.tables import print_validation
 from bayesrace.vehicles.models import dynamic, e_kinematic

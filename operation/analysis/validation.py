@@ -10,9 +10,9 @@ from pydantic import BaseModel, ConfigDict, Field
 from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import GpWeights
-from bayesrace.learning.dataset import Dataset, discretisation_of, left_out
+from bayesrace.learning.dataset import Dataset, left_out
 from bayesrace.learning.sources import read_samples
-from bayesrace.learning.validation import HORIZON, Validation, mismatch, validate
+from bayesrace.learning.validation import HORIZON, Validation, discretisation_of, mismatch, validate
 from bayesrace.operation.analysis.results import GpMetrics, gp_metrics
 from bayesrace.operation.terminal import UNCERTAIN
 from bayesrace.vehicles import CarParameters, get_car

@@ -83,9 +83,10 @@ def train(
     Of more samples than --points, those with the largest predictive variance are chosen one by one.
     """
     from bayesrace.gp.weights import KERNELS, write_weights
-    from bayesrace.learning.dataset import discretisation_of, left_out
+    from bayesrace.learning.dataset import left_out
     from bayesrace.learning.sources import read_samples
     from bayesrace.learning.training import fit
+    from bayesrace.learning.validation import discretisation_of
     from bayesrace.manifest import read_manifest
     from bayesrace.operation.terminal import tables
     from bayesrace.operation.terminal.terminal import Terminal

@@ -17,11 +17,11 @@ from threadpoolctl import threadpool_limits
 from bayesrace.arrays import Floats, Rows
 from bayesrace.gp.weights import OUTPUTS, UNITS, GpWeights, read_weights
 from bayesrace.integrators import PREDICTION, Discretisation
-from bayesrace.learning.dataset import Dataset, concatenate, residual
+from bayesrace.learning.dataset import Dataset, concatenate
 from bayesrace.learning.gaussian_process import PairDistances, Posterior, maximise, starts
 from bayesrace.learning.settings import TrainingSettings
 from bayesrace.learning.target import Target
-from bayesrace.learning.validation import Validation, validate
+from bayesrace.learning.validation import Validation, residual, validate
 from bayesrace.operation.preparation import trained_weights
 from bayesrace.operation.report.gp import gp_figures
 from bayesrace.operation.report.style import INK, WARNING, look, panel
