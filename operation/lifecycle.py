@@ -34,6 +34,7 @@ from bayesrace.messages import (
     Command,
     Message,
     Reply,
+    Service,
     Status,
     StatusRequest,
     StopRequest,
@@ -45,8 +46,8 @@ from bayesrace.transport import Endpoints, Inbox, Kind, ask_all, decisive, open_
 from bayesrace.transport.credentials import NEWEST_LIST
 
 __all__ = [
-    "SOURCES", "Action", "Found", "NetworkStatus", "ProcessStatus", "ask_statuses", "command",
-    "command_cars", "find", "follow", "pick", "route",
+    "SOURCES", "Action", "Found", "NetworkStatus", "ProcessStatus", "ask_statuses", "command_cars",
+    "find", "follow", "pick", "route",
 ]  # fmt: skip
 
 _log = logging.getLogger("bayesrace.router")
@@ -251,44 +252,33 @@ def pick(found: Found, name: str, all_cars: bool, source: str = "controller") ->
     raise InputError(f"several cars found: {', '.join(cars)}; choose one with --name")
 
 
-def command(
-    session: Any, cars: Collection[str], action: Action, text: str, timeout_s: float
-) -> dict[str, Reply | str]:
-    """Command the controllers of these cars, all at once: each one's reply, or why there is none.
-
-    "end" ends the current runs of their plants. ``text``: the reason.
-    """
-    now_ns = time.monotonic_ns()
-    request: Message = (
-        StopRequest(seq=0, source_time_ns=now_ns, text=text)
-        if action == "end"
-        else Command(seq=0, source_time_ns=now_ns, command=action, text=text)
-    )
-    service: Any = STOP if action == "end" else COMMAND
-    keys = {car_key(service.key, car): car for car in cars}
-    return {
-        keys[key]: decisive(answers.valid) or answers.fault or f"no answer within {timeout_s:g} s"
-        for key, answers in ask_all(session, service, keys, request, timeout_s).items()
-    }
-
-
 def command_cars(
     endpoints: Endpoints, action: Action, name: str, all_cars: bool, text: str, timeout_s: float
 ) -> tuple[list[str], list[str]]:
-    """:func:`command` for the cars that :func:`pick` chooses: what they answer in words, and what
-    those answer that refuse or are silent."""
+    """Commands the controllers of the cars that :func:`pick` chooses, all at once: what they answer
+    in words, and what those answer that refuse or are silent.
+
+    "end" ends the current runs of their plants. ``text``: the reason.
+    """
     done, failed = [], []
-    name = endpoints.car_named(name)
-    source = "plant" if action == "end" else "controller"
+    name, now_ns = endpoints.car_named(name), time.monotonic_ns()
+    service: Service[Any, Reply] = COMMAND
+    request: Message = Command(seq=0, source_time_ns=now_ns, command=action, text=text)
+    if action == "end":
+        service, request = STOP, StopRequest(seq=0, source_time_ns=now_ns, text=text)
+    source = service.servers[0]
     with open_session(endpoints, "director", reports_absence=False) as session:
         cars = pick(find(session, endpoints, timeout_s, name, (source,)), name, all_cars, source)
-        answers = command(session, cars, action, text, timeout_s)
-    for car, answer in answers.items():
-        if isinstance(answer, Reply) and answer.accepted:
-            done.append(f"{car}: {answer.text}")
-        else:
-            why = f"refused: {answer.text}" if isinstance(answer, Reply) else f"failed: {answer}"
-            failed.append(f"{action} of car '{car}' {why}")
+        keys = {car_key(service.key, car): car for car in cars}
+        found = ask_all(session, service, keys, request, timeout_s)
+    for key, answers in found.items():
+        answer = decisive(answers.valid)
+        if answer is not None and answer.accepted:
+            done.append(f"{keys[key]}: {answer.text}")
+            continue
+        silent = answers.fault or f"no answer within {timeout_s:g} s"
+        why = f"failed: {silent}" if answer is None else f"refused: {answer.text}"
+        failed.append(f"{action} of car '{keys[key]}' {why}")
     return done, failed
 
 

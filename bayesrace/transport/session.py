@@ -285,18 +285,12 @@ def _without_settings(endpoint: str) -> str:
 
 
 def _is_among(endpoint: str, ends: set[str]) -> bool:
+    """By protocol and port, because names are not looked up."""
     address = address_of(endpoint)
     if address.protocol == "unixsock-stream":
         return _without_settings(endpoint) in ends
-    if address.protocol not in ("tcp", "tls"):
-        return any(end.startswith(address.protocol) for end in ends)
-    try:
-        found = socket.getaddrinfo(address.host, address.port, type=socket.SOCK_STREAM)
-    except OSError:
-        return False
-    hosts = {str(one[4][0]) for one in found}
-    named = {f"[{host}]" if ":" in host else host for host in hosts}
-    return any(f"{address.protocol}/{host}:{address.port}" in ends for host in named)
+    port = f":{address.port}" if address.protocol in ("tcp", "tls") else ""
+    return any(end.startswith(f"{address.protocol}/") and end.endswith(port) for end in ends)
 
 
 def access_control(members: Members) -> dict[str, Any]:
