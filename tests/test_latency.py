@@ -2,13 +2,11 @@
 
 import io
 import json
-import random
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from hdrh.log import HistogramLogReader
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from rich.console import Console
@@ -18,7 +16,7 @@ from bayesrace.studies.latency.analysis import Analysis, Beside, analyse
 from bayesrace.studies.latency.beside import bare_loop, bare_result
 from bayesrace.studies.latency.legs import ANSWER, BESIDE, LEGS, ClockMap
 from bayesrace.studies.latency.report import print_report, write_files
-from bayesrace.studies.latency.results import Memory, Series, new_histogram
+from bayesrace.studies.latency.results import Memory, Series
 from bayesrace.studies.latency.settings import LatencySettings
 from bayesrace.transport import Endpoints
 from tests.synthetic_latency import PERIOD_NS, Loop, report_of
@@ -258,24 +256,7 @@ def test_messages_that_neither_side_counted_are_shown(path: Path) -> None:
     assert found["actuations"].complete
 
 
-# Histograms and the bare loop ------------------------------------------------------------------
-
-
-def test_histogram_logs_are_read_back_by_the_library(tmp_path: Path) -> None:
-    chance = random.Random(1)
-    ns = np.array([*(chance.uniform(1e5, 9e6) for _ in range(999)), -40.0])
-    series = Series(np.linspace(0.0, 9.99, 1000), ns)
-    series.write_log(tmp_path / "leg.hlog", "state → actuation", 1.8e9, np.linspace(0, 10, 11))
-    reader = HistogramLogReader(str(tmp_path / "leg.hlog"), new_histogram())
-    total, intervals = new_histogram(), 0
-    while (interval := reader.get_next_interval_histogram()) is not None:
-        total.add(interval)
-        intervals += 1
-    assert (intervals, total.get_total_count()) == (10, 1000)
-    found = series.distribution()
-    for name, share in (("p50", 50), ("p99", 99), ("p999", 99.9), ("max", 100)):
-        expected = total.get_value_at_percentile(share) * 1e-3
-        assert getattr(found, name) == pytest.approx(expected, rel=2e-3), name
+# Percentiles and the bare loop ------------------------------------------------------------------
 
 
 def test_percentiles_are_those_of_the_values() -> None:
@@ -445,8 +426,10 @@ def test_files_are_made_of_whatever_was_measured(
 ) -> None:
     write_files(tmp_path, analysis if measured else replace(analysis, series={}))
     assert (tmp_path / "latency.png").read_bytes().startswith(b"\x89PNG")
-    logs = {path.stem for path in tmp_path.glob("*.hlog")}
-    assert logs == ({*LEGS, *BESIDE} if measured else set())
+    with np.load(tmp_path / "legs.npz") as values:
+        assert set(values) == ({*LEGS, *BESIDE} if measured else set())
+        for name in values:
+            np.testing.assert_array_equal(values[name][1], analysis.series[name].ns)
     content = json.loads((tmp_path / "latency.json").read_text())
     assert content == json.loads(analysis.result.model_dump_json())
     promised = {

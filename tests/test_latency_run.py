@@ -13,8 +13,8 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
-from hdrh.log import HistogramLogReader
 
 from bayesrace.errors import InputError
 from bayesrace.log import LogReader
@@ -25,7 +25,6 @@ from bayesrace.operation.settings import PreparationSettings
 from bayesrace.operation.terminal.terminal import stages_on
 from bayesrace.studies.latency.legs import BESIDE, LEGS
 from bayesrace.studies.latency.measure import _wait_for_run
-from bayesrace.studies.latency.results import new_histogram
 from bayesrace.tracks import Track
 from bayesrace.transport import Director, Endpoints, free_endpoint, open_session
 from tests.command_line import Cli, refused
@@ -115,16 +114,12 @@ def test_memory_laps_and_clocks_are_reported(loaded: Run) -> None:
 
 def test_files_are_those_of_the_documentation(loaded: Run) -> None:
     names = {path.name for path in loaded.out.iterdir()}
-    logs = {f"{name}.hlog" for name in (*LEGS, *BESIDE)}
-    assert logs | {"latency.json", "latency.png", "settings.json", "run.mcap"} <= names
-    for name in logs:
-        reader = HistogramLogReader(str(loaded.out / name), new_histogram())
-        total = 0
-        while (interval := reader.get_next_interval_histogram()) is not None:
-            total += interval.get_total_count()
-        leg = loaded.result["legs_us"].get(name.removesuffix(".hlog"))
-        expected = leg or loaded.result[f"{name.removesuffix('.hlog')}_us"]
-        assert total == expected["count"], name
+    assert {"latency.json", "latency.png", "legs.npz", "settings.json", "run.mcap"} <= names
+    with np.load(loaded.out / "legs.npz") as values:
+        assert set(values) == {*LEGS, *BESIDE}
+        for name in values:
+            leg = loaded.result["legs_us"].get(name) or loaded.result[f"{name}_us"]
+            assert values[name].shape == (2, leg["count"]), name
 
 
 def test_the_log_of_a_run_gives_the_same_legs_again(loaded: Run, cli: Cli, tmp_path: Path) -> None:
@@ -139,7 +134,8 @@ def test_the_log_of_a_run_gives_the_same_legs_again(loaded: Run, cli: Cli, tmp_p
     assert "recorded" in done.out
 
 
-def _with_parent(pid: int) -> list[str]:
+def _with_parent(pid: int, word: str = "") -> list[int]:
+    """Processes that end with this one, those whose command line has this word."""
     found = []
     for entry in Path("/proc").glob("[0-9]*/cmdline"):
         try:
@@ -147,19 +143,8 @@ def _with_parent(pid: int) -> list[str]:
         except OSError:
             continue
         if "--parent-pid" in words and words[words.index("--parent-pid") + 1] == str(pid):
-            found.append(" ".join(words))
+            found += [int(entry.parent.name)] if not word or word in words else []
     return found
-
-
-def _child_pid(parent: int, word: str) -> int | None:
-    for entry in Path("/proc").glob("[0-9]*/cmdline"):
-        try:
-            words = entry.read_bytes().decode(errors="replace").split("\0")
-        except OSError:
-            continue
-        if word in words and "--parent-pid" in words and str(parent) in words:
-            return int(entry.parent.name)
-    return None
 
 
 def _observing(out: Path) -> bool:
@@ -176,8 +161,7 @@ def test_killed_controller_ends_it_with_a_reason_and_a_report(
 ) -> None:
     process = start("latency", *files.arguments, "--duration", "60", "--out", tmp_path / "run")
     until(lambda: _observing(tmp_path / "run"), "time observed")
-    controller = _child_pid(process.pid, "controller")
-    assert controller is not None
+    (controller,) = _with_parent(process.pid, "controller")
     os.kill(controller, signal.SIGKILL)
     done = finish(process)
     assert done.returncode == 1

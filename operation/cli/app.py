@@ -28,7 +28,7 @@ _INTERRUPTED: Final = 130
 _EXTRAS: Final = {
     "fmu": ("fmpy", "pint"),
     "race": (
-        "PIL", "casadi", "contourpy", "hdrh", "jinja2", "lz4", "matplotlib", "mcap", "rich",
+        "PIL", "casadi", "contourpy", "jinja2", "lz4", "matplotlib", "mcap", "rich",
         "scipy", "sklearn", "threadpoolctl", "yaml", "zstandard",
     ),
     "campaign": ("bokeh", "dask", "distributed", "optuna", "pandas", "pyarrow"),

@@ -166,7 +166,7 @@ def latency(
 
     Starts plant and controller as processes and drives the track in real time. A loop that only
     sleeps runs beside them: its delays are those of the machine, not of the program. Leaves
-    latency.json, a picture and HdrHistogram logs; see docs/latency.md.
+    latency.json, a picture and all values; see docs/latency.md.
     """
     chosen = settings()
     if endpoint and not attach:

@@ -47,7 +47,7 @@ _COUNTS: Final = (
 
 _BATCH: Final = 4096
 _INTERVALS: Final = 60
-"""Of the histogram logs and of the medians, at most; each takes two seconds at least."""
+"""Of the medians, at most; each takes two seconds at least."""
 
 
 @dataclass
@@ -70,9 +70,7 @@ class Analysis:
     series: dict[str, Series]
     """By leg, and of what ran beside; one without values is left out."""
     edges_s: Floats
-    """Of the intervals of logs and medians, since the first state that counts."""
-    begin_s: float
-    """Calendar time of that state."""
+    """Of the intervals of medians, since the first state that counts."""
 
 
 def analyse(log: Path, settings: LatencySettings, track: Track | None, beside: Beside) -> Analysis:
@@ -117,7 +115,7 @@ def analyse(log: Path, settings: LatencySettings, track: Track | None, beside: B
         series["bare_loop"] = beside.bare[0]
     if beside.round_trip is not None:
         series["round_trip"] = beside.round_trip
-    return Analysis(result, series, edges_s, begin_ns * 1e-9)
+    return Analysis(result, series, edges_s)
 
 
 def _series(

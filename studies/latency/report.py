@@ -5,7 +5,7 @@ The picture shows how often each leg takes how long, and where a cycle's time go
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from rich.console import Console
 from rich.text import Text
 
-from bayesrace.files import write_whole
+from bayesrace.files import replacing, write_whole
 from bayesrace.operation.report.style import INK, MUTED, figure_style, write_png
 from bayesrace.operation.terminal.terminal import plain_table
 from bayesrace.studies.latency.analysis import Analysis
@@ -46,10 +46,12 @@ _POINTS: Final = 2000
 
 
 def write_files(out: Path, analysis: Analysis) -> None:
-    """``latency.json``, ``latency.png``, and a histogram log of each leg and of what ran beside."""
-    for name, series in analysis.series.items():
-        title = LEGS[name][0] if name in LEGS else BESIDE[name]
-        series.write_log(out / f"{name}.hlog", title, analysis.begin_s, analysis.edges_s)
+    """``latency.json``, ``latency.png``, and ``legs.npz``: every value of each leg and of what ran
+    beside, (2, n), times since the first state [s] above durations [ns]."""
+    series = analysis.series
+    values: dict[str, Any] = {leg: np.stack([one.at_s, one.ns]) for leg, one in series.items()}
+    with replacing(out / "legs.npz") as path:
+        np.savez_compressed(path, **values)
     _plot(out / "latency.png", analysis)
     write_whole(out / RESULT, analysis.result.model_dump_json(indent=1) + "\n")
 

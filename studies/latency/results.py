@@ -1,21 +1,16 @@
 """What is measured of a leg over time, and the content of ``latency.json``."""
 
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
-from hdrh.histogram import HdrHistogram
-from hdrh.log import HistogramLogWriter
 from pydantic import BaseModel, ConfigDict, Field
 
 from bayesrace.arrays import Floats
-from bayesrace.files import replacing
 
 __all__ = ["BareLoop", "Clocks", "Distribution", "LatencyResult", "LegResult", "Memory", "Series"]
-__all__ += ["Traffic", "new_histogram"]
+__all__ += ["Traffic"]
 
-_LARGEST_NS: Final = 60_000_000_000
 _PERCENTILES: Final = (50.0, 90.0, 99.0, 99.9, 100.0)
 
 
@@ -33,11 +28,6 @@ class Distribution(_Frozen):
     p999: float
     max: float
     count: int
-
-
-def new_histogram() -> Any:
-    """A histogram of 1 ns to 60 s to three digits."""
-    return HdrHistogram(1, _LARGEST_NS, 3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,24 +50,6 @@ class Series:
     def intervals(self, edges_s: Floats) -> list[Floats]:
         """The values of each interval; the outer ones take the values beyond the edges."""
         return np.split(self.ns, np.searchsorted(self.at_s, edges_s[1:-1]))
-
-    def write_log(self, path: Path, title: str, epoch_s: float, edges_s: Floats) -> None:
-        """An HdrHistogram log in ns, a line for each interval with values; calendar time at the
-        beginning is ``epoch_s``."""
-        with replacing(path) as partial, partial.open("w", encoding="ascii") as file:
-            log = HistogramLogWriter(file)
-            log.output_comment(f"[bayesrace latency: {title.replace('→', 'to')}; values in ns]")
-            log.output_log_format_version()
-            # The library's own output_start_time raises.
-            log.output_comment(f"[StartTime: {epoch_s:.3f} (seconds since epoch)]")
-            log.output_legend()
-            for k, values in enumerate(self.intervals(edges_s)):
-                histogram = new_histogram()
-                for value in np.rint(values).clip(0, _LARGEST_NS).astype(np.int64).tolist():
-                    histogram.record_value(value)
-                if len(values):
-                    begin_s = max(float(edges_s[k]), 1e-6)  # 0 means the histogram's own
-                    log.output_interval_histogram(histogram, begin_s, float(edges_s[k + 1]), 1e3)
 
 
 class LegResult(Distribution):
