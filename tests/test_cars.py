@@ -22,7 +22,7 @@ from bayesrace.vehicles import (
     read_car,
     write_car,
 )
-from bayesrace.vehicles.files import MODELS, SECTIONS
+from bayesrace.vehicles.parameters import MODELS, SECTIONS
 from bayesrace.vehicles.parts import Pacejka
 from tests.command_line import Cli
 

@@ -2,8 +2,7 @@
 
 With the true model, tyres and actuators' limits as the plant has them; gates, first guess and IPOPT
 are the racing line's (:mod:`bayesrace.raceline`). Order: the lap as a file (lap.py), the nonlinear
-programme (ocp.py; outline.py for the car's outline), solved from the racing line on, on meshes
-twice as fine each (solve.py).
+programme (ocp.py), solved from the racing line on, on meshes twice as fine each (solve.py).
 
 CasADi is imported on the first call of :func:`compute_limit`, not with this package.
 """

@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
-from bayesrace.tracks.tables import read_about, read_table, write_table
+from bayesrace.tracks.tables import read_table, write_table
 
 __all__ = ["LimitLap", "LimitSettings", "read_limit", "write_limit"]
 
@@ -77,8 +77,7 @@ def write_limit(path: Path | str, lap: LimitLap) -> None:
 
 def read_limit(path: Path | str) -> LimitLap:
     """The limit in a file that :func:`write_limit` has written; InputError naming what is wrong."""
-    table, _ = read_table(Path(path), _COLUMNS)
-    said = read_about(Path(path))
+    table, _, said = read_table(Path(path), _COLUMNS)
     try:
         about = {key: kind(said[key]) for key, kind in _KEYS.items()}
         if not (0 < about["lap_s"] < math.inf):

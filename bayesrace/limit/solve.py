@@ -9,8 +9,7 @@ import numpy as np
 from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
 from bayesrace.limit.lap import LimitLap, LimitSettings
-from bayesrace.limit.ocp import Lap, optimise, usual_interval
-from bayesrace.limit.outline import Outline
+from bayesrace.limit.ocp import Lap, Outline, optimise, usual_interval
 from bayesrace.raceline import RaceLine, racing_line
 from bayesrace.raceline.gates import Gates, flying_gates, smooth_centreline, standing_gates
 from bayesrace.tracks import Track

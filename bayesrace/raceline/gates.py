@@ -12,8 +12,7 @@ import numpy as np
 from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
 from bayesrace.tracks import StartLine, Track
-from bayesrace.tracks.shapes import resample_closed, smooth_closed
-from bayesrace.tracks.spline import PlaneSpline, fit_arc_length
+from bayesrace.tracks.spline import PlaneSpline, fit_arc_length, resample_closed, smooth_closed
 from bayesrace.vehicles.tuning import RacelineTuning
 
 __all__ = [

@@ -18,7 +18,7 @@ from bayesrace.arrays import Floats
 from bayesrace.cache import digest
 from bayesrace.errors import InputError
 from bayesrace.tracks import Track
-from bayesrace.tracks.tables import read_about, read_table, write_table
+from bayesrace.tracks.tables import read_table, write_table
 from bayesrace.vehicles.parameters import CarParameters
 
 __all__ = [
@@ -128,7 +128,7 @@ def read_raceline(path: Path | str, track_name: str | None = None) -> RaceLine:
     ``track_name``: default: the file's name. Raises InputError naming file, row and remedy.
     """
     path = Path(path)
-    table, rows = read_table(path, _COLUMNS)
+    table, rows, about = read_table(path, _COLUMNS)
     if len(table) < _MIN_POINTS:
         raise InputError(
             f"{path}: too few points ({len(table)}); a racing line needs at least {_MIN_POINTS}"
@@ -163,7 +163,7 @@ def read_raceline(path: Path | str, track_name: str | None = None) -> RaceLine:
     name = path.stem if track_name is None else track_name
     s, x, y, psi, kappa, v, a = np.ascontiguousarray(table.T)
     psi = _continuous(psi, table[:, 1:3])
-    return RaceLine(name, s, x, y, psi, kappa, v, a, length, _made_for(path))
+    return RaceLine(name, s, x, y, psi, kappa, v, a, length, _made_for(about))
 
 
 def _continuous(psi: Floats, xy: Floats) -> Floats:
@@ -174,9 +174,8 @@ def _continuous(psi: Floats, xy: Floats) -> Floats:
     return np.asarray(np.unwrap(psi + np.pi / 2 if from_y_axis else psi))
 
 
-def _made_for(path: Path) -> LineIdentity | None:
+def _made_for(about: dict[str, str]) -> LineIdentity | None:
     """None unless the comments say all of it."""
-    about = read_about(path)
     try:
         width_m, friction = float(about["width_m"]), float(about["friction"])
         made = LineIdentity(about["car"], width_m, friction, about["track"], about["settings"])

@@ -12,7 +12,7 @@ import numpy as np
 from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
 from bayesrace.tracks.checks import clearance_m, find_crossing
-from bayesrace.tracks.shapes import Corner, rounded_polygon
+from bayesrace.tracks.spline import Corner, rounded_polygon
 from bayesrace.tracks.track import Track
 
 __all__ = ["RANDOM_TRACKS", "random_track"]

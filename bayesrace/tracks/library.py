@@ -22,7 +22,7 @@ from bayesrace.tracks.checks import (
     find_value_fault,
 )
 from bayesrace.tracks.generator import RANDOM_TRACKS, random_track
-from bayesrace.tracks.shapes import rounded_polygon, smooth
+from bayesrace.tracks.spline import rounded_polygon, smooth
 from bayesrace.tracks.tables import read_table, write_table
 from bayesrace.tracks.track import Track, drop_repeated
 
@@ -223,7 +223,7 @@ def read_smoothed(path: Path | str, car_width_m: float | None = None) -> tuple[T
 
 def _read_points(path: Path) -> tuple[Floats, Floats, Floats, list[int]]:
     """Points (n, 2), widths to the right and to the left (n,), number of each row."""
-    table, rows = read_table(path, _COLUMNS)
+    table, rows, _ = read_table(path, _COLUMNS)
     return *drop_repeated(table[:, :2], table[:, 2], table[:, 3]), rows
 
 

@@ -22,7 +22,7 @@ from bayesrace.arrays import Floats
 from bayesrace.errors import InputError, faults_in
 from bayesrace.files import read_text
 from bayesrace.tracks.checks import default_car_width_m, find_fault
-from bayesrace.tracks.shapes import resample_closed, smooth_closed
+from bayesrace.tracks.spline import resample_closed, smooth_closed
 from bayesrace.tracks.track import Track
 
 __all__ = ["RosMap", "read_map", "track_of_map"]

@@ -16,7 +16,7 @@ from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
 from bayesrace.files import read_text, write_whole
 
-__all__ = ["read_about", "read_table", "write_table"]
+__all__ = ["read_table", "write_table"]
 
 _MOST_POINTS: Final = 20_000
 """Rows of a file: a point each centimetre of a track ten times as long as any here."""
@@ -39,15 +39,9 @@ def write_table(
     write_whole(Path(path), "\n".join(lines) + "\n")
 
 
-def read_about(path: Path) -> dict[str, str]:
-    """What a file's comments say, by key."""
-    rows = read_text(path, "the CSV file").splitlines()
-    found = (_KEY.fullmatch(row) for row in rows if row.startswith("#"))
-    return {match[1]: match[2] for match in found if match}
-
-
-def read_table(path: Path, columns: tuple[str, ...]) -> tuple[Floats, list[int]]:
-    """Numbers (n, len(columns)) of a CSV file and the line number of each row.
+def read_table(path: Path, columns: tuple[str, ...]) -> tuple[Floats, list[int], dict[str, str]]:
+    """Numbers (n, len(columns)) of a CSV file, the line number of each row, and what the comments
+    say, by key.
 
     A header with these names in another order is honoured. Raises InputError for a file that can't
     be read, a header with other units, a wrong column count or a cell that is no number; what the
@@ -56,8 +50,11 @@ def read_table(path: Path, columns: tuple[str, ...]) -> tuple[Floats, list[int]]
     text = read_text(path, "the CSV file", "give an existing one, of at most 20,000 points")
     values: list[list[float]] = []
     rows: list[int] = []
+    about: dict[str, str] = {}
     order = list(range(len(columns)))
     for row, line in enumerate(text.splitlines(), start=1):
+        if said := _KEY.fullmatch(line):
+            about[said[1]] = said[2]
         if not rows and (header := _header(path, row, line, columns)):
             order = header
             continue
@@ -72,7 +69,7 @@ def read_table(path: Path, columns: tuple[str, ...]) -> tuple[Floats, list[int]]
         numbers = _numbers(path, row, _cells(content), columns)
         values.append([numbers[i] for i in order])
         rows.append(row)
-    return np.array(values, dtype=float).reshape(-1, len(columns)), rows
+    return np.array(values, dtype=float).reshape(-1, len(columns)), rows, about
 
 
 def _cells(line: str) -> list[str]:

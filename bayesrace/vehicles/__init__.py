@@ -1,8 +1,9 @@
-"""Cars as data (:mod:`.parts`, :mod:`.parameters`), their size-dependent numbers (:mod:`.tuning`)
-and TOML files (:mod:`.files`), and their models as expressions (:mod:`.models`, CasADi)."""
+"""Cars as data and as TOML files (:mod:`.parts`, :mod:`.parameters`), their size-dependent numbers
+(:mod:`.tuning`), and their models as expressions (:mod:`.models`, CasADi)."""
 
-from bayesrace.vehicles.files import (
+from bayesrace.vehicles.parameters import (
     DEFAULT_CAR,
+    CarParameters,
     CarSetting,
     builtin_cars,
     car_text,
@@ -12,7 +13,6 @@ from bayesrace.vehicles.files import (
     read_car,
     write_car,
 )
-from bayesrace.vehicles.parameters import CarParameters
 from bayesrace.vehicles.tuning import Tuning
 
 __all__ = [

@@ -213,7 +213,7 @@ def published_line(path: Path, track: Track, car: CarParameters) -> RaceLine:
     Where the file drives on beyond a lap, at speed, the closed line has the speeds of that second
     pass. InputError for a file that cannot be read.
     """
-    table, _ = read_table(path, _COLUMNS)
+    table, *_ = read_table(path, _COLUMNS)
     s = np.unwrap(track.project_path(table[:, 1:3]).s_m, period=track.length_m)
     lap = s < s[0] + track.length_m - _JOIN_M
     again = s[lap] + track.length_m
