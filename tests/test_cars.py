@@ -128,13 +128,8 @@ def test_a_fault_is_reported_with_field_value_and_meaning(
 
 
 def test_a_missing_file_is_refused_with_the_remedy(tmp_path: Path) -> None:
-    assert "bayesrace cars orca --out" in refusal_of_missing(tmp_path / "none.toml")
-
-
-def refusal_of_missing(path: Path) -> str:
-    with pytest.raises(InputError) as caught:
-        get_car(str(path))
-    return str(caught.value)
+    with pytest.raises(InputError, match="bayesrace cars orca --out"):
+        get_car(str(tmp_path / "none.toml"))
 
 
 def test_tuning_follows_from_the_cars_own_scales(tmp_path: Path) -> None:

@@ -54,35 +54,22 @@ def refusal(path: Path, **options: float) -> str:
     return message
 
 
-@pytest.mark.parametrize(
-    "lines",
-    [
-        [HEADER, *rows()],
-        rows(),
-        ["x_m,y_m,w_tr_right_m,w_tr_left_m", *rows()],
-        ["# one", "", "  # two", *[row.replace(",", " , ") for row in rows()], ""],
-        [HEADER, *[row.replace(",", "; ") for row in rows()]],
-        [HEADER, *[row.replace(",", "\t") for row in rows()]],
-        [HEADER, *[row.replace(",", "   ") for row in rows()]],
-        ["# x_m,y_m,w_tr_left_m,w_tr_right_m", *swapped(rows())],
-        ["x;y;width_left;width_right", *swapped(rows())],
-        [*[row + "  # note" for row in rows()], rows()[0]],
-        ["\ufeff" + HEADER, *rows()],
-    ],
-    ids=[
-        "hash",
-        "bare",
-        "names",
-        "spaces",
-        "semicolon",
-        "tab",
-        "blanks",
-        "left first",
-        "other names",
-        "repeated",
-        "bom",
-    ],
-)
+VARIANTS = {
+    "hash": [HEADER, *rows()],
+    "bare": rows(),
+    "names": ["x_m,y_m,w_tr_right_m,w_tr_left_m", *rows()],
+    "spaces": ["# one", "", "  # two", *[row.replace(",", " , ") for row in rows()], ""],
+    "semicolon": [HEADER, *[row.replace(",", "; ") for row in rows()]],
+    "tab": [HEADER, *[row.replace(",", "\t") for row in rows()]],
+    "blanks": [HEADER, *[row.replace(",", "   ") for row in rows()]],
+    "left first": ["# x_m,y_m,w_tr_left_m,w_tr_right_m", *swapped(rows())],
+    "other names": ["x;y;width_left;width_right", *swapped(rows())],
+    "repeated": [*[row + "  # note" for row in rows()], rows()[0]],
+    "bom": ["\ufeff" + HEADER, *rows()],
+}
+
+
+@pytest.mark.parametrize("lines", VARIANTS.values(), ids=VARIANTS)
 def test_every_variant_gives_the_same_track(tmp_path: Path, lines: list[str]) -> None:
     track = read_track(written(tmp_path, lines))
     assert track.name == "loop"
@@ -132,10 +119,10 @@ def test_the_car_decides_how_wide_a_track_must_be(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("factors", "car_width_m", "size", "unit"),
     [
-        ((1000, None), 0.05, "500 m wide, 10000 times the car", "in millimetres; divide them by"),
-        ((100, None), 0.05, "50 m wide, 1000 times the car", "in centimetres; divide them by"),
+        ((1000, None), 0.05, "500 m wide, 10000 times the car", "in millimetres; give"),
+        ((100, None), 0.05, "50 m wide, 1000 times the car", "in centimetres; give"),
         ((1000, None), None, "m long and 500 m wide", "in millimetres or centimetres; give"),
-        ((100, None), None, "1861 m long and 50 m wide", "in centimetres; give them in metres"),
+        ((100, None), None, "1861 m long and 50 m wide", "in centimetres; give"),
         ((100, 1), 0.05, "0.5 m wide", "x, y and the widths probably have different units"),
         ((20000, 1), 0.05, "0.5 m wide", "x, y and the widths probably have different units"),
     ],

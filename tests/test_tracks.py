@@ -4,6 +4,7 @@ import math
 import subprocess
 import sys
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from hypothesis import strategies as st
 
 from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
+from bayesrace.raceline import write_raceline
 from bayesrace.tracks import (
     DEFAULT_RACE_TRACK,
     DEFAULT_TRAINING_TRACK,
@@ -25,13 +27,7 @@ from bayesrace.tracks import (
 from bayesrace.tracks.checks import clearance_m, find_crossing
 from bayesrace.tracks.spline import fit_arc_length
 from tests.reference import reference_file
-
-
-def circle(radius: float = 1.0, count: int = 60, width: float = 0.2) -> Track:
-    """Anticlockwise circle about the origin, starting at (radius, 0)."""
-    angle = np.arange(count) * (2 * np.pi / count)
-    xy = radius * np.column_stack([np.cos(angle), np.sin(angle)])
-    return Track.from_points("circle", xy, width, width)
+from tests.test_raceline import circle, ring
 
 
 def stadium(straight: float = 3.0, radius: float = 0.25, spacing: float = 0.04) -> Track:
@@ -325,11 +321,13 @@ def test_from_points_names_the_point_that_is_wrong(points: Floats, message: str)
         Track.from_points("t", points, 0.2, 0.2)
 
 
-def test_importing_tracks_imports_nothing_slow() -> None:
+def test_tracks_and_lines_are_read_without_slow_imports(tmp_path: Path) -> None:
     """The controller process starts without CasADi, scipy or matplotlib."""
+    path = tmp_path / "ring.csv"
+    write_raceline(path, ring())
     code = (
         "import sys, bayesrace.tracks as t; t.load_track('random:1').project_points((0, 0)); "
-        "import bayesrace.raceline; "
+        f"from bayesrace.raceline import read_raceline; read_raceline({str(path)!r}); "
         "print([m for m in ('casadi', 'scipy', 'matplotlib', 'sklearn') if m in sys.modules])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

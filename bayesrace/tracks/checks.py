@@ -25,8 +25,8 @@ MIN_POINTS = 8
 _DUPLICATE_M = 1e-6
 _OPEN = 4.0
 """A gap between the last and the first point of more than this many times the longest other one."""
-_MOST_CARS, _USUAL_CARS = 100.0, 7.0
-"""Cars side by side on the widest plausible track, and on a usual one of any scale."""
+_MOST_CARS = 100.0
+"""Cars side by side on the widest plausible track."""
 _WIDEST_M, _NARROWEST_M = 25.0, 0.15
 """Plausible widths of tracks, from 1:43 to full scale."""
 _MOST_WIDTHS = 2_500.0
@@ -161,22 +161,16 @@ def find_scale_fault(
             f"the track is {farthest_m:.3g} m from the origin and {width_m:.3g} m wide",
             "make its first point the origin: 'bayesrace tracks FILE --recentre --out local.csv'",
         )
-    if width_m <= (_WIDEST_M if car_width_m is None else _MOST_CARS * car_width_m):
+    narrowest_m, widest_m = _NARROWEST_M, _WIDEST_M
+    if car_width_m is not None:
+        narrowest_m, widest_m = car_width_m, _MOST_CARS * car_width_m
+        size += f", {width_m / car_width_m:.0f} times the car"
+    if width_m <= widest_m:
         return None
-    if car_width_m is None:
-        units = [name for name, by in _UNITS.items() if _NARROWEST_M < width_m / by < _WIDEST_M]
-        return Fault(
-            None, size, f"the values are probably in {' or '.join(units) or 'another unit'}; "
-            "give them in metres",
-        )  # fmt: skip
-    cars = width_m / car_width_m
-    unit = min(_UNITS, key=lambda name: abs(np.log(cars / _UNITS[name] / _USUAL_CARS)))
-    return Fault(
-        None,
-        f"{size}, {cars:.0f} times the car",
-        f"the values are probably in {unit}; divide them by {_UNITS[unit]:.0f}, or choose a car "
-        "of the track's scale",
-    )
+    units = [name for name, by in _UNITS.items() if narrowest_m < width_m / by < widest_m]
+    probably = f"the values are probably in {' or '.join(units) or 'another unit'}"
+    remedy = "" if car_width_m is None else ", or choose a car of the track's scale"
+    return Fault(None, size, f"{probably}; give them in metres{remedy}")
 
 
 def find_crossing(points: Floats) -> tuple[int, int] | None:

@@ -5,6 +5,7 @@ and F1TENTH communities use, ``x_m, y_m, w_tr_right_m, w_tr_left_m``, one row pe
 the first may be repeated at the end. tables.py has what all CSV files may look like.
 """
 
+import re
 import tomllib
 from functools import cache
 from pathlib import Path
@@ -48,7 +49,7 @@ DEFAULT_RACE_TRACK: Final = "harbour"
 _COLUMNS: Final = ("x_m", "y_m", "w_tr_right_m", "w_tr_left_m")
 _CIRCUITS: Final = Path(__file__).with_name("circuits.toml")
 _MAPS: Final = (".yaml", ".yml")
-_SEED_DIGITS: Final = 18
+_RANDOM: Final = re.compile(rf"({'|'.join(RANDOM_TRACKS)}):[0-9]{{1,18}}")
 
 
 def builtin_tracks() -> tuple[str, ...]:
@@ -75,8 +76,7 @@ def _builtin_track(name: str) -> Track:
 
 def is_random_track(name: str) -> bool:
     """Whether the name is that of a generated circuit: ``random:SEED`` or ``random10:SEED``."""
-    kind, _, seed = name.partition(":")
-    return kind in RANDOM_TRACKS and _is_seed(seed)
+    return _RANDOM.fullmatch(name) is not None
 
 
 def load_track(name_or_path: str | Path, car_width_m: float | None = None) -> Track:
@@ -91,7 +91,12 @@ def load_track(name_or_path: str | Path, car_width_m: float | None = None) -> Tr
         return _wide_enough(_builtin_track(text), car_width_m)
     kind, colon, seed = text.partition(":")
     if colon and kind in RANDOM_TRACKS:
-        return _wide_enough(random_track(_seed(text, seed), kind), car_width_m)
+        if not is_random_track(text):
+            raise InputError(
+                f"'{text[:40]}': the seed must be a whole number from 0 on, of at most 18 digits, "
+                "as in random:7"
+            )
+        return _wide_enough(random_track(int(seed), kind), car_width_m)
     path = Path(name_or_path)
     if not path.is_file():
         raise InputError(
@@ -131,19 +136,6 @@ def load_any(
         track, (x, y) = read_recentred(name, car_width_m)
         return track, None, f"the origin is at x = {float(x)}, y = {float(y)} of the file"
     return load_track(name, car_width_m), None, ""
-
-
-def _seed(text: str, digits: str) -> int:
-    if not _is_seed(digits):
-        raise InputError(
-            f"'{text[:40]}': the seed must be a whole number from 0 on, of at most {_SEED_DIGITS} "
-            "digits, as in random:7"
-        )
-    return int(digits)
-
-
-def _is_seed(digits: str) -> bool:
-    return digits.isascii() and digits.isdigit() and len(digits) <= _SEED_DIGITS
 
 
 def _wide_enough(track: Track, car_width_m: float | None) -> Track:
