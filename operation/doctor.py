@@ -169,9 +169,7 @@ def probe(endpoint: str, credentials: Credentials | None) -> str:
     try:
         connection = socket.create_connection((address.host, address.port), _CONNECT_S)
     except ConnectionRefusedError:
-        return (
-            f"nobody listens at {endpoint}: start the process that should, or correct the endpoint"
-        )
+        return f"nothing listens at {endpoint}: start its process, or correct the endpoint"
     except socket.gaierror:
         return f"{endpoint}: the name '{address.host}' is not known: correct it, or give an address"
     except TimeoutError:

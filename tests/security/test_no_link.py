@@ -23,7 +23,7 @@ __all__ = ["bundles"]
 
 pytestmark = pytest.mark.wall_clock
 
-ABSENT: Final = "nobody listens at"
+ABSENT: Final = "nothing listens at"
 FOREIGN: Final = "of another authority"
 NO_LINK: Final = "no link to {} yet"
 
