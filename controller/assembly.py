@@ -172,20 +172,22 @@ def compiled_controller(
     car: CarParameters,
     track: Track,
     line: RaceLine,
-    weights: GpWeights | None = None,
+    weights: GpWeights | Path | None = None,
     settings: MpcSettings | None = None,
     *,
     table: PathTable | None = None,
 ) -> PredictiveController:
-    """The compiled controller of ``artefact`` on a track, ready to drive; without ``weights`` it
-    predicts by the uncorrected model. ``table``: of track and line, where it is known already.
+    """The compiled controller of ``artefact`` on a track, ready to drive.
+
+    ``weights``, or their file: without, it predicts by the uncorrected model. ``table``: of track
+    and line, where it is known already.
 
     Raises InputError if artefact, car, line or weights do not fit together.
     """
     step = NativeStep(artefact, car, settings or MpcSettings())
     step.set_path(table or make_path_table(track, line, car.tuning.path.spacing_m))
     if weights is not None:
-        step.set_weights(weights)
+        step.set_weights(read_weights(weights) if isinstance(weights, Path) else weights)
     return PredictiveController(step, track=track.identity)
 
 

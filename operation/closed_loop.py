@@ -9,7 +9,6 @@ import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -19,12 +18,10 @@ from numpy.typing import NDArray
 from bayesrace.arrays import Floats
 from bayesrace.codegen.compiler import compiled
 from bayesrace.columns import Columns, columns_of
-from bayesrace.controller.assembly import compiled_controller
 from bayesrace.controller.cycle import Cycle
 from bayesrace.controller.driver import Decision
 from bayesrace.controller.interface import Controller, Environment
 from bayesrace.controller.process_settings import ControllerSettings
-from bayesrace.gp.weights import GpWeights
 from bayesrace.learning.dataset import Dataset
 from bayesrace.learning.sources import CYCLES, STATES, dataset_from_columns
 from bayesrace.log import LogWriter
@@ -55,7 +52,7 @@ from bayesrace.tracks import PathProjection, Track
 from bayesrace.vehicles import CarParameters
 from bayesrace.vehicles.models import dynamic
 
-__all__ = ["ClosedLoop", "Driven", "built_in_car", "drive_compiled"]
+__all__ = ["ClosedLoop", "Driven", "built_in_car"]
 
 
 _EPOCH: Final = 1
@@ -88,6 +85,8 @@ class Driven(Trajectory):
     second_starts: int
     """Steps that looked for another plan beside the one that went on from before."""
     end: End
+    weights_version: str
+    """Of the weights that drove; empty without any."""
 
     @cached_property
     def moments(self) -> Columns:
@@ -240,6 +239,7 @@ class ClosedLoop:
             np.array(self._step_us),
             self._cycle.driver.count("second_starts") - second_starts,
             end,
+            self._controller.weights_version,
         )
 
     def _exchange(self, state: State, x: tuple[float, ...]) -> tuple[float, ...]:
@@ -303,18 +303,3 @@ class _Messages:
             data=data,
         )
         self.write(EVENT, event, "plant")
-
-
-def drive_compiled(
-    artefact: Path,
-    track: Track,
-    line: RaceLine,
-    weights: GpWeights | None = None,
-    *,
-    car: CarParameters,
-    laps: int = 2,
-    vehicle: Vehicle | None = None,
-) -> Driven:
-    """One run of the compiled controller with default settings."""
-    controller = compiled_controller(artefact, car, track, line, weights)
-    return ClosedLoop(car, track, line, controller, vehicle).drive(laps)

@@ -9,7 +9,6 @@ from typing import Final, NamedTuple
 from bayesrace.arrays import Floats
 from bayesrace.controller.assembly import compiled_controller
 from bayesrace.errors import InputError
-from bayesrace.gp.weights import read_weights
 from bayesrace.learning.search import search
 from bayesrace.operation.closed_loop import ClosedLoop, built_in_car
 from bayesrace.operation.preparation import prepare
@@ -54,11 +53,10 @@ def driven_lap(artefact: Path, weights: Path | None, track: Track, car: CarParam
     Without ``weights`` by the uncorrected model. Raises InputError if artefact, weights and car do
     not fit together.
     """
-    learned = None if weights is None else read_weights(weights)
     vehicle = built_in_car(car)
 
     def drive(line: RaceLine) -> float:
-        controller = compiled_controller(artefact, car, track, line, learned)
+        controller = compiled_controller(artefact, car, track, line, weights)
         limit_s = _LIMIT * 2 * line.lap_time_s + _START_S
         driven = ClosedLoop(car, track, line, controller, vehicle).drive(2, limit_s)
         finished = len(driven.laps_s) == 2 and float(driven.off_track_m.max()) <= 0

@@ -17,7 +17,7 @@ from bayesrace.codegen.settings import BuildSettings
 from bayesrace.columns import LogColumns
 from bayesrace.errors import InputError
 from bayesrace.files import read_whole, replacing
-from bayesrace.gp.weights import GpWeights, encode_weights, read_weights, write_weights
+from bayesrace.gp.weights import encode_weights, read_weights, write_weights
 from bayesrace.integrators import Discretisation
 from bayesrace.learning.dataset import Dataset, concatenate
 from bayesrace.learning.settings import Progress, TrainingSettings
@@ -262,24 +262,25 @@ def trained_weights(
     samples: Dataset,
     discretisation: Discretisation,
     settings: TrainingSettings,
-    initial: GpWeights | None = None,
+    initial: Path | None = None,
     progress: Progress | None = None,
 ) -> Path:
     """File of what :func:`train` returns; trained only if these arguments are new."""
+    first = None if initial is None else read_weights(initial)
     path = _place(
         "weights-{}.bin", ("scipy",),
         samples.digest(),
         str(samples.car.mirrored_samples),
         discretisation.model_dump_json(),
         settings.model_dump_json(exclude={"threads"}),
-        b"" if initial is None else encode_weights(replace(initial, created_utc_ns=0)),
+        b"" if first is None else encode_weights(replace(first, created_utc_ns=0)),
     )  # fmt: skip
 
     def make(partial: Path) -> None:
         # Imported here: it takes a second, and most commands find their weights in the cache.
         from bayesrace.learning.training import train
 
-        weights = train(samples, discretisation, settings, initial, progress)
+        weights = train(samples, discretisation, settings, first, progress)
         write_weights(partial, weights)
 
     kept(path, make, read_weights)
@@ -289,7 +290,7 @@ def trained_weights(
 def updated_weights(
     samples: Sequence[Dataset],
     settings: PreparationSettings,
-    first: GpWeights,
+    first: Path,
     progress: Progress | None = None,
 ) -> Path:
     """File of the weights learned from all samples, beginning with ``first``."""

@@ -18,7 +18,6 @@ from bayesrace.codegen.compiler import find_compiler
 from bayesrace.columns import LogColumns
 from bayesrace.errors import InputError
 from bayesrace.files import claimed, write_whole
-from bayesrace.gp.weights import read_weights
 from bayesrace.learning.dataset import Dataset
 from bayesrace.learning.sources import dataset_from_columns
 from bayesrace.limit import LimitSettings, known_limit, write_limit
@@ -328,7 +327,6 @@ class Drives:
     def _updated(self, driven: RunPlan, weights: Path, name: str, number: str = "") -> Path:
         """Weights learned from a run and all samples before it, beginning with ``weights``."""
         self._learned_from.append(self.samples(driven))
-        first = read_weights(weights)
         with self._stages.stage(f"update the residual{number}") as stage:
-            learned = updated_weights(self._learned_from, self._settings, first, stage.update)
+            learned = updated_weights(self._learned_from, self._settings, weights, stage.update)
             return Path(shutil.copyfile(learned, self._out / name))

@@ -10,7 +10,7 @@ import pytest
 
 from bayesrace.cache import digest, kept
 from bayesrace.errors import InputError
-from bayesrace.gp.weights import GpWeights, read_weights
+from bayesrace.gp.weights import GpWeights, read_weights, write_weights
 from bayesrace.integrators import PREDICTION
 from bayesrace.learning.settings import TrainingSettings
 from bayesrace.operation import preparation
@@ -122,6 +122,9 @@ def test_weights_are_kept_for_their_samples_settings_and_beginning(
         arguments: list[Any] = [samples, PREDICTION, settings, None]
         for position, change in zip(changes[::2], changes[1::2], strict=True):
             assert isinstance(position, int)
+            if isinstance(change, GpWeights):
+                write_weights(tmp_path / "first.bin", change)
+                change = tmp_path / "first.bin"
             arguments[position] = change
         return read_weights(preparation.trained_weights(*arguments)).version
 

@@ -222,9 +222,10 @@ def test_each_update_learns_from_all_laps_before_it(
 ) -> None:
     learned = []
 
-    def recorded(samples: list[Dataset], settings: RaceSettings, first: GpWeights) -> Path:
+    def recorded(samples: list[Dataset], settings: RaceSettings, first: Path) -> Path:
         made = updated_weights(samples, settings, first)
-        learned.append(([len(one) for one in samples], first.version, read_weights(made).version))
+        versions = (read_weights(one).version for one in (first, made))
+        learned.append(([len(one) for one in samples], *versions))
         return made
 
     monkeypatch.setattr("bayesrace.operation.preparation.updated_weights", recorded)

@@ -131,48 +131,28 @@ def test_states_that_come_back_drive_again_after_several_good_solutions(rig: Rig
     assert levels == [Level.BRAKE, Level.BRAKE, Level.SOLUTION, Level.SOLUTION]
 
 
-def test_an_infeasible_problem_is_answered_by_the_plan_before(
-    native: NativeStep, circuit: Circuit
+@pytest.mark.parametrize(
+    ("delay_s", "index", "number", "status"),
+    [
+        # Steered farther than a period at full rate can bring back within the limit.
+        (0.0, 6, 0.6, StepStatus.INFEASIBLE),
+        (0.0, 4, np.nan, StepStatus.BAD_STATE),
+        # With a delay to predict over, the model is asked before the step is.
+        (0.02, 4, np.nan, UNPREDICTABLE),
+        (0.02, 4, 1e5, UNPREDICTABLE),
+    ],
+)
+def test_a_state_without_a_solution_is_answered_by_the_plan_before(
+    native: NativeStep, circuit: Circuit, delay_s: float, index: int, number: float, status: int
 ) -> None:
-    """Steered farther than a period at full rate can bring back within the limit."""
-    rig = driving(Rig(native, circuit, sensor_tolerance=0))
+    rig = driving(Rig(native, circuit, delay_s=delay_s, sensor_tolerance=0))
     x = rig.x.copy()
-    x[6] = 0.6
+    x[index] = number
     decision = rig.cycle(x=tuple(x))
-    assert decision.status == StepStatus.INFEASIBLE
-    assert decision.level is Level.SHIFTED_PLAN
-
-
-def test_a_state_that_is_no_number_is_not_driven_on(native: NativeStep, circuit: Circuit) -> None:
-    rig = driving(Rig(native, circuit, sensor_tolerance=0))
-    x = rig.x.copy()
-    x[4] = np.nan
-    decision = rig.cycle(x=tuple(x))
-    assert decision.status == StepStatus.BAD_STATE
-    assert decision.level is Level.SHIFTED_PLAN
-    assert rig.cycle().level is Level.SOLUTION
-
-
-@pytest.mark.parametrize("number", [np.nan, 1e5])
-def test_a_state_that_cannot_be_predicted_from_is_not_driven_on(
-    native: NativeStep, circuit: Circuit, number: float
-) -> None:
-    """With a delay to predict over, the model is asked before the step is."""
-    rig = driving(Rig(native, circuit, delay_s=0.02, sensor_tolerance=0))
-    x = rig.x.copy()
-    x[4] = number
-    decision = rig.cycle(x=tuple(x))
-    assert (decision.status, decision.level) == (UNPREDICTABLE, Level.SHIFTED_PLAN)
+    assert (decision.status, decision.level) == (status, Level.SHIFTED_PLAN)
     rig.driver.rehearse()
-    assert rig.cycle().level is Level.SOLUTION
-
-
-def test_silence_after_such_a_state_ends_at_a_level_too(
-    native: NativeStep, circuit: Circuit
-) -> None:
-    rig = driving(Rig(native, circuit, delay_s=0.02, sensor_tolerance=0))
-    x = rig.x.copy()
-    x[4] = np.nan
+    if index != 6:
+        assert rig.cycle().level is Level.SOLUTION
     rig.cycle(x=tuple(x))
     for _ in range(20):
         rig.silent_cycle()

@@ -11,6 +11,7 @@ from bayesrace.arrays import Floats
 from bayesrace.codegen.build import build
 from bayesrace.codegen.fmu import car_fmu, pack
 from bayesrace.codegen.settings import BuildSettings
+from bayesrace.controller.assembly import compiled_controller
 from bayesrace.controller.pure_pursuit import PurePursuit
 from bayesrace.controller.python_controller import PythonController
 from bayesrace.gp.weights import GpWeights, read_weights
@@ -18,7 +19,7 @@ from bayesrace.integrators import PREDICTION
 from bayesrace.learning.settings import TrainingSettings
 from bayesrace.learning.training import train
 from bayesrace.operation.analysis.results import read_result
-from bayesrace.operation.closed_loop import ClosedLoop, drive_compiled
+from bayesrace.operation.closed_loop import ClosedLoop
 from bayesrace.operation.preparation import prepare
 from bayesrace.operation.settings import PreparationSettings, RaceSettings
 from bayesrace.operation.terminal.terminal import stages_on
@@ -98,7 +99,8 @@ def test_a_lap_that_was_learned_from_pure_pursuit_stays_on_the_small_track(tmp_p
     samples = loop.drive(0, CAR.tuning.pursuit.drive_s).samples()
     settings = TrainingSettings(kernels=("matern25",), restarts=0, hyper_points=200)
     weights = train(samples, PREDICTION, settings)
-    run = drive_compiled(artefact, track, line, weights, car=CAR)
+    controller = compiled_controller(artefact, CAR, track, line, weights)
+    run = ClosedLoop(CAR, track, line, controller).drive()
     assert len(run.laps_s) == 2
     assert not (run.off_track_m > 0).any()
     assert run.laps_s[1] < 1.02 * line.lap_time_s

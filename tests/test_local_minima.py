@@ -1,13 +1,14 @@
 """A plan that has gone into a bad local minimum is left again: laps stay on the track."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from rich.console import Console
 
 from bayesrace.controller.assembly import compiled_controller
 from bayesrace.controller.native_step import StepStatus
-from bayesrace.gp.weights import read_weights
-from bayesrace.operation.closed_loop import drive_compiled
+from bayesrace.operation.closed_loop import ClosedLoop, Driven
 from bayesrace.operation.preparation import prepare, updated_weights
 from bayesrace.operation.settings import PreparationSettings
 from bayesrace.operation.terminal.terminal import stages_on
@@ -23,11 +24,15 @@ def test_with_a_model_that_is_right_the_laps_stay_on_the_track() -> None:
     assert prepared.training is not None
     nominal, true = prepared.artefacts
     on = prepared.first.track, prepared.first.line
-    weights = read_weights(prepared.weights)
-    laps = drive_compiled(nominal, *on, weights, car=car).samples()
-    learned = read_weights(updated_weights([prepared.training.samples, laps], settings, weights))
-    updated = drive_compiled(nominal, *on, learned, car=car)
-    perfect = drive_compiled(true, *on, car=car)
+
+    def driven(artefact: Path, weights: Path | None = None) -> Driven:
+        controller = compiled_controller(artefact, car, *on, weights)
+        return ClosedLoop(car, *on, controller).drive()
+
+    laps = driven(nominal, prepared.weights).samples()
+    samples = [prepared.training.samples, laps]
+    updated = driven(nominal, updated_weights(samples, settings, prepared.weights))
+    perfect = driven(true)
     assert updated.off_track_m.max() <= 0
     assert perfect.off_track_m.max() <= 0
     for mine, best in zip(updated.laps_s, perfect.laps_s, strict=True):

@@ -137,9 +137,9 @@ class WeightUpdateManager:
         except InputError as refusal:
             text, data = str(refusal), getattr(refusal, "data", {})
         finally:
-            self._answer(request, accepted, text, data)
             if not accepted and request.service is WEIGHTS:
                 self._announce("weights_refused", text, data)
+            self._answer(request, accepted, text, data)
 
     def _update(self, request: Request, reverted: int, due_s: float) -> _Answer:
         """Judges, stages, adopts and keeps the weights of a request."""

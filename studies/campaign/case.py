@@ -26,7 +26,6 @@ from rich.console import Console
 from bayesrace.cache import cache_folder, cpu_digest, digest, software
 from bayesrace.controller.assembly import compiled_controller, make_path_table
 from bayesrace.files import read_whole, write_whole
-from bayesrace.gp.weights import GpWeights, read_weights
 from bayesrace.learning.dataset import Dataset
 from bayesrace.operation import preparation
 from bayesrace.operation.analysis.laps import trajectory_digest
@@ -222,7 +221,7 @@ class _Runs:
     def __init__(self, case: Case) -> None:
         self._case, self._settings = case, case.settings
         self._runs: dict[Controller, Driven] = {}
-        self._updates: dict[tuple[Controller, ...], GpWeights] = {}
+        self._updates: dict[tuple[Controller, ...], Path] = {}
         """Weights that are learned from laps, by whose."""
 
     def drive(self, controller: Controller) -> list[Row]:
@@ -238,7 +237,7 @@ class _Runs:
                 weights = self._learned(samples, weights)
                 driven = self._driven(controller, weights)
         run = {
-            "controller": controller, "weights": "" if weights is None else weights.version,
+            "controller": controller, "weights": driven.weights_version,
             "trajectory_sha256": trajectory_digest(driven.x, driven.laps),
             "ended": driven.end.reason, "drive_s": time.perf_counter() - begun,
             "simulated_s": float(driven.time_s[-1]),
@@ -256,10 +255,10 @@ class _Runs:
         settings = PreparationSettings.model_validate(wanted)
         return _prepared(settings, self._settings.track, models, self._case.weights)
 
-    def _weights(self, controller: Controller) -> GpWeights:
+    def _weights(self, controller: Controller) -> Path:
         """Those of the training drive, or learned from the laps of others, too."""
         if controller not in LEARNS_FROM:
-            return read_weights(self._files.weights)
+            return self._files.weights
         sources = LEARNS_FROM[controller]
         if sources not in self._updates:
             samples, before = self._samples_of(sources), self._weights(sources[-1])
@@ -274,10 +273,10 @@ class _Runs:
             raise RuntimeError(f"there are no laps of {who} to learn from")
         return [training.samples, *(self._runs[one].samples() for one in controllers)]
 
-    def _learned(self, samples: list[Dataset], before: GpWeights) -> GpWeights:
-        return read_weights(preparation.updated_weights(samples, self._settings, before))
+    def _learned(self, samples: list[Dataset], before: Path) -> Path:
+        return preparation.updated_weights(samples, self._settings, before)
 
-    def _driven(self, controller: Controller, weights: GpWeights | None) -> Driven:
+    def _driven(self, controller: Controller, weights: Path | None) -> Driven:
         settings, best = self._settings, controller == "bestcase"
         on = self._files.first.track, self._files.first.line
         artefact = self._files.artefacts[1 if best else 0]

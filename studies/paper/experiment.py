@@ -17,7 +17,6 @@ from bayesrace.controller.assembly import compiled_controller
 from bayesrace.controller.process_settings import ControllerSettings
 from bayesrace.errors import InputError
 from bayesrace.files import read_text
-from bayesrace.gp.weights import GpWeights, read_weights
 from bayesrace.learning.dataset import Dataset
 from bayesrace.learning.sources import dataset_from_columns
 from bayesrace.log import LogWriter
@@ -52,11 +51,11 @@ class Experiment:
         self.track, self._line = prepared.first.track, prepared.first.line
         self.train_track = prepared.training.driven_on.track
         self.training = prepared.training.samples
-        self.weights, self._artefacts = read_weights(prepared.weights), prepared.artefacts
+        self.weights, self._artefacts = prepared.weights, prepared.artefacts
         self._vehicle = built_in_car(self.car)
 
     def drive(
-        self, controller: str, weights: GpWeights | None = None, constraints: bool = True,
+        self, controller: str, weights: Path | None = None, constraints: bool = True,
         speed: float = 1.0, line: RaceLine | None = None,
     ) -> DrivenRun:  # fmt: skip
         """A lap from standstill, or up to where the car is farther off than the track is wide.
@@ -89,10 +88,10 @@ class Experiment:
         record, step_s = run.record, self.settings.discretisation.step_s
         return dataset_from_columns(record.states, record.telemetry, self.car, step_s)
 
-    def updated(self, lap: DrivenRun) -> GpWeights:
+    def updated(self, lap: DrivenRun) -> Path:
         """Learned from training drive and lap, beginning with the weights before."""
         samples = [self.training, self.samples(lap)]
-        return read_weights(updated_weights(samples, self.settings, self.weights))
+        return updated_weights(samples, self.settings, self.weights)
 
 
 def stored(name: str, parts: Iterable[str], make: Callable[[], Any]) -> Any:

@@ -8,6 +8,7 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from itertools import product
+from pathlib import Path
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -15,7 +16,7 @@ from matplotlib.figure import Figure
 from threadpoolctl import threadpool_limits
 
 from bayesrace.arrays import Floats, Rows
-from bayesrace.gp.weights import OUTPUTS, UNITS, GpWeights, read_weights
+from bayesrace.gp.weights import OUTPUTS, UNITS, read_weights
 from bayesrace.integrators import PREDICTION, Discretisation
 from bayesrace.learning.dataset import Dataset, concatenate
 from bayesrace.learning.gaussian_process import PairDistances, Posterior, maximise, starts
@@ -132,7 +133,7 @@ class Learned(NamedTuple):
     test: Dataset
     tracks: tuple[Track | None, Track | None]
     """Of both drives."""
-    weights: tuple[GpWeights, GpWeights]
+    weights: tuple[Path, Path]
 
 
 def learned(
@@ -142,11 +143,11 @@ def learned(
     """From the published drives: pure pursuit, BayesRace's lap, BestCase's."""
     training, lap, test = drives
     with stages.stage("train on the published drive") as stage:
-        path = trained_weights(training, PREDICTION, settings, None, stage.update)
-    both, before = concatenate([training, lap]), read_weights(path)
+        before = trained_weights(training, PREDICTION, settings, None, stage.update)
+    both = concatenate([training, lap])
     with stages.stage("update with the published lap") as stage:
-        path = trained_weights(both, PREDICTION, settings, before, stage.update)
-    return Learned("published", training, test, tracks, (before, read_weights(path)))
+        after = trained_weights(both, PREDICTION, settings, before, stage.update)
+    return Learned("published", training, test, tracks, (before, after))
 
 
 def learning_sections(every: Sequence[Learned]) -> list[Section]:
@@ -160,7 +161,8 @@ def learning_sections(every: Sequence[Learned]) -> list[Section]:
         maps[f"training-{name}"] = _map(one.training, one.tracks[0], f"{name} training drive")
         step_m = np.linalg.norm(test.x_next[:, :2] - test.x[:, :2], axis=1)
         found = {}
-        for (stage, controller), weights in zip(_STAGES.items(), one.weights, strict=True):
+        for (stage, controller), path in zip(_STAGES.items(), one.weights, strict=True):
+            weights = read_weights(path)
             # On a busy machine the threads of BLAS wait for each other longer than they work.
             with threadpool_limits(1):
                 found[stage] = judged = validate(weights, test, PREDICTION)

@@ -1,8 +1,5 @@
-"""What is accepted is kept: it survives its controller, and a disk that is full."""
+"""What is accepted is kept: it survives its controller."""
 
-import resource
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -27,17 +24,6 @@ def history(car: CarParameters, *proven: bool) -> History:
 def numbers(folder: Path) -> list[int]:
     """Of the weights that a controller started now finds."""
     return [one.number for one in Store(folder, "d").restore(START).entries]
-
-
-@contextmanager
-def full_disk(free_bytes: int) -> Iterator[None]:
-    """No file can become longer than that: what a disk that fills up does to a writer."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (free_bytes, hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
 def test_what_is_kept_is_found_again(tmp_path: Path, car: CarParameters) -> None:
@@ -84,21 +70,3 @@ def test_a_damaged_file_is_left_out(tmp_path: Path, car: CarParameters) -> None:
     newest = max(tmp_path.glob("*.bin"))
     newest.write_bytes(newest.read_bytes()[:-1])
     assert numbers(tmp_path) == [0, 1]
-
-
-@pytest.mark.parametrize("free_bytes", [0, 100])
-def test_a_full_disk_leaves_what_was_kept_before(
-    tmp_path: Path, car: CarParameters, free_bytes: int
-) -> None:
-    """And nothing else; what could not be kept is kept as soon as it can."""
-    kept = history(car, True)
-    store = Store(tmp_path, "d")
-    store.keep(kept)
-    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
-    with full_disk(free_bytes):
-        for one in (history(car, True, True), history(car)):  # the latter: the index alone
-            with pytest.raises(InputError, match="File too large"):
-                store.keep(one)
-    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
-    store.keep(history(car, True, True))
-    assert numbers(tmp_path) == [0, 1, 2]

@@ -1,12 +1,14 @@
 """New weights for a running controller, with real processes: adopted, refused, rolled back.
 
 Promises guarded: the car stays on its track whatever weights are sent; taking over the same weights
-changes no bit; accepted weights are in use from the cycle on that the answer names.
+changes no bit; accepted weights are in use from the cycle on that the answer names, and survive a
+restart; the end of a check does not touch the drive.
 """
 
-import itertools
+import os
+import signal
 import threading
-import time
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,16 +16,23 @@ from typing import Any
 import numpy as np
 import pytest
 
+from bayesrace.arrays import Floats
+from bayesrace.controller.assembly import predictive_controller
+from bayesrace.controller.cycle import Cycle
+from bayesrace.controller.driver import Decision
+from bayesrace.controller.process_settings import ControllerSettings
 from bayesrace.gp.weights import GpWeights, encode_weights, write_weights, zero_weights
-from bayesrace.messages import ACTUATION, TELEMETRY
-from bayesrace.transport import Director, send_rollback
-from tests.network.cars import Course
+from bayesrace.messages import ACTUATION, State
+from bayesrace.transport import Director, Endpoints, free_endpoint, open_session, send_rollback
+from bayesrace.vehicles import get_car
+from tests.network.cars import Course, start_controller, start_plant
 from tests.programs import until
-from tests.takeover.oracle import converged, replayed
-from tests.takeover.rig import DRIVEN_S, Rig, digest, rigged
+from tests.takeover.rig import DRIVEN_S, Rig, digest, judges, rigged
 from tests.takeover.spoilt_weights import SPOILT, spoilt
 
 pytestmark = [pytest.mark.wall_clock, pytest.mark.unmeasured]
+
+CAR = get_car("orca")
 
 # Lockstep ------------------------------------------------------------------------------------
 
@@ -47,6 +56,31 @@ def test_adopting_the_same_weights_changes_no_bit(rig: Rig, good: GpWeights) -> 
     first, *others = (digest(rig.states(run)) for run in runs)
     assert others == [first] * len(others)
     assert rig.counters()["weights_accepted"] == taken
+
+
+def replayed(course: Course, states: Sequence[State], weights: Mapping[int, GpWeights]) -> Floats:
+    """Inputs (n, 2) of a controller that answers these states of a lockstep run, one by one.
+
+    ``weights``: new ones, by the index of the first state that they answer.
+    """
+    files = course.track_file, course.line_file
+    controller = predictive_controller(course.artefact, CAR, *files, weights=course.weights_file)
+    cycle = Cycle(controller, CAR, ControllerSettings())
+    inputs: list[tuple[float, float]] = []
+
+    def take_over() -> None:
+        if len(inputs) in weights:
+            controller.native.set_weights(weights[len(inputs)])
+
+    def send(_: State, decision: Decision) -> None:
+        inputs.append((decision.d, decision.delta_rate))
+        take_over()
+
+    take_over()
+    for state in states:
+        assert cycle.driver.observe(state)
+        cycle.answer(state, send)
+    return np.array(inputs)
 
 
 def test_inputs_jump_by_what_the_new_model_explains(
@@ -191,59 +225,6 @@ def test_back_and_back_to_the_start(rig: Rig, good: GpWeights) -> None:
 # Free-running --------------------------------------------------------------------------------
 
 
-def test_each_cycle_names_its_weights_and_the_inputs_do_not_jump(
-    rig: Rig, course: Course, good: GpWeights, again: GpWeights
-) -> None:
-    """Ten takeovers in some two laps: versions change at the cycles that answers name, and inputs
-    little more than between other cycles and by what the new model explains.
-    """
-    rig.start(1, lockstep=False, seconds=100.0)
-    until(lambda: rig.counters()["ticks"] > 150, "three seconds of driving")
-    named, weights = {}, {good.version: good}
-    for number in range(10):
-        new = replace((again, good)[number % 2], version=f"v{number}")
-        answer = rig.send(new)
-        named[answer["version"]] = answer["cycle"]
-        weights[new.version] = new
-        time.sleep(0.2)
-    after = rig.counters()
-    rig.director.stop("enough")
-    end = rig.director.wait_for_end(1, 60.0)
-    assert after["weights_accepted"] == 10
-    stalled = rig.held_up(end)
-    assert stalled or rig.off_track_m(1) < 0.0
-    sent = rig.reader().select(ACTUATION)
-    telemetry_of = {t.seq: t for t in rig.reader().select(TELEMETRY)}
-    cycles = sorted(t.tick for t in telemetry_of.values())
-    versions: dict[str, int] = {}
-    for actuation in sent:
-        if actuation.seq in telemetry_of:
-            versions.setdefault(actuation.weights_version, telemetry_of[actuation.seq].tick)
-    for version, cycle in named.items():
-        due = next(tick for tick in cycles if tick >= cycle)
-        assert abs(versions[version] - due) <= 1  # messages may be lost
-    jumps = np.diff([one.u for one in sent], axis=0)
-    at_takeover = [a.weights_version != b.weights_version for a, b in itertools.pairwise(sent)]
-    assert sum(at_takeover) == 10
-    calm = np.abs(jumps[10:][~np.array(at_takeover[10:])]).max(axis=0)
-    explained = []
-    for index in np.flatnonzero(at_takeover):
-        before, after_it = sent[index], sent[index + 1]
-        plan = telemetry_of[after_it.seq].plan_x if after_it.seq in telemetry_of else ()
-        if not plan:  # fallen back, or the message is lost
-            continue
-        from_old, from_new = (
-            converged(course, weights[one.weights_version], plan[:7], before.u[0])
-            for one in (before, after_it)
-        )
-        explained.append(from_new - from_old)
-        # Where the machine stalls, states skip, and inputs with them; in lockstep
-        # test_inputs_jump_by_what_the_new_model_explains is exact.
-        assert stalled or (np.abs(jumps[index] - explained[-1]) <= 2 * calm).all()
-    assert len(explained) >= 5
-    assert np.abs(explained).max() > 1e-3  # or there is nothing to explain
-
-
 @pytest.mark.check
 def test_spoilt_weights_are_rolled_back_in_real_time(rig: Rig, good: GpWeights) -> None:
     rig.send(spoilt(good, "flip all"))
@@ -277,3 +258,65 @@ def test_two_publishers_at_once_leave_one_order(rig: Rig, good: GpWeights) -> No
         mine = [by_number[n] for n in sorted(by_number) if by_number[n].startswith(name)]
         assert mine == [f"{name}{number}" for number in range(5)]
     rig.director.wait_for_end(1, 30.0)
+
+
+# Processes that end ---------------------------------------------------------------------------
+
+
+def test_a_check_that_is_killed_does_not_touch_the_drive(rig: Rig, good: GpWeights) -> None:
+    """The request is refused, and the drive is the same, to the bit, as one undisturbed."""
+    rig.drive(1, seconds=10.0)
+    rig.start(2, seconds=600.0)
+    pid = rig.controller.process.pid
+    refused: list[str] = []
+    request = threading.Thread(target=lambda: refused.append(rig.refusal(encode_weights(good))))
+    request.start()
+    until(lambda: judges(pid) != [], "a check")
+    os.kill(judges(pid)[0], signal.SIGKILL)
+    request.join()
+    assert "ended with code -9" in refused[0]
+    assert rig.send(replace(good, version="after"))["number"] == 1
+    rig.director.stop("enough")
+    rig.director.wait_for_end(2, 60.0)
+    undisturbed, disturbed = ([one for one in rig.states(run) if not one.final] for run in (1, 2))
+    count = min(len(undisturbed), len(disturbed))
+    assert count > 100
+    assert digest(disturbed[:count]) == digest(undisturbed[:count])
+    assert rig.off_track_m(1) < 0.0
+
+
+def test_accepted_weights_survive_a_restart(
+    tmp_path: Path, course: Course, good: GpWeights
+) -> None:
+    """Killed right after the answer; another --weights does not matter any more."""
+    store = str(tmp_path / "store")
+    at_plant, at_controller = free_endpoint(), free_endpoint()
+    where = tmp_path, course, at_plant, at_controller, "--store", store
+    with (
+        start_plant(tmp_path, at_plant),
+        open_session(Endpoints(connect=(at_plant, at_controller))) as session,
+    ):
+        director = Director(session, "orca")
+        with start_controller(*where) as controller:
+            director.wait_for(("controller",), 20.0)
+            director.send_weights(encode_weights(replace(good, version="one")))
+            director.send_weights(encode_weights(replace(good, version="two")))
+            controller.kill()
+        director.wait_until_gone("controller", 20.0)
+        with start_controller(*where) as controller:
+            director.wait_for(("controller",), 20.0)
+            status = director.status("controller")
+            assert (status.weights_version, status.counters["weights_number"]) == ("two", 2)
+            assert send_rollback(session, "orca", "to see").data["version"] == "one"
+            assert (
+                director.send_weights(encode_weights(replace(good, version="x"))).data["number"]
+                == 3
+            )
+            controller.end()
+        director.wait_until_gone("controller", 20.0)
+        with start_controller(*where) as controller:
+            director.wait_for(("controller",), 20.0)
+            assert director.status("controller").weights_version == "x"
+            assert send_rollback(session, "orca", "to see").data["version"] == "one"
+            assert send_rollback(session, "orca", "to the start").data["version"] == good.version
+            controller.end()
