@@ -128,7 +128,6 @@ def generate(problem: "Problem", settings: BuildSettings, folder: Path) -> None:
         f"#define BR_TS {settings.discretisation.step_s!r}\n"
         f"#define BR_GP_CAPACITY {settings.gp_capacity}\n"
         f"#define BR_ABI {interface_version()}\n"
-        f'#define BR_MODEL_NAME "{settings.model}"\n'
         f'#define BR_MODEL_IDENTITY "{_model_identity(settings)}"\n'
         "#endif\n"
     )

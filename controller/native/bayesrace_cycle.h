@@ -5,7 +5,8 @@
  * the messages and keeps the time; examples/c_host is one without Python, controller/ the one of
  * the controller process.
  *
- *   br_cycle_answer(cycle, &state, NULL, state.time_s, budget, 0, &decision);   a state has arrived
+ *   br_cycle_observe(cycle, &state);                                      a state has arrived
+ *   br_cycle_decide(cycle, NULL, state.time_s, budget, 0, &decision);
  *   (send decision.u)
  *   br_cycle_prepare(cycle, period, budget);              while waiting for the next one
  *
@@ -230,12 +231,6 @@ BR_API br_reception br_cycle_observe(br_cycle *cycle, const br_measured *state);
 BR_API br_mpc_error br_cycle_decide(br_cycle *cycle, const br_environment *environment,
                                     double decided_at_s, double budget_s, double spent_s,
                                     br_decision *decision);
-
-/* Both in one. BR_ERROR_STATE for a state that is not to be answered; after another error the state
- * has been taken, and br_cycle_decide decides on it. */
-BR_API br_mpc_error br_cycle_answer(br_cycle *cycle, const br_measured *state,
-                                    const br_environment *environment, double decided_at_s,
-                                    double budget_s, double spent_s, br_decision *decision);
 
 /* br_mpc_prepare for a state that is expected a period after the last one, where one is. */
 BR_API void br_cycle_prepare(br_cycle *cycle, double period_s, double budget_s);

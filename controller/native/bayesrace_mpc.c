@@ -345,6 +345,4 @@ const char *br_mpc_status_text(br_mpc_status status) {
     return (unsigned)status < sizeof texts / sizeof texts[0] ? texts[status] : "unknown status";
 }
 
-const char *br_mpc_model_name(void) { return BR_MODEL_NAME; }
-
 int br_mpc_abi(void) { return BR_ABI; }

@@ -23,7 +23,7 @@
 
 #include <stddef.h>
 
-#include "br_config.h"  /* generated: BR_N, BR_TS, BR_GP_CAPACITY, BR_MODEL_NAME, BR_ABI */
+#include "br_config.h"  /* generated: BR_N, BR_TS, BR_GP_CAPACITY, BR_MODEL_IDENTITY, BR_ABI */
 #include "br_problem.h" /* generated: sizes, BR_PARAMETERS, br_mpc_reference */
 
 #ifdef __cplusplus
@@ -343,7 +343,6 @@ BR_API int br_mpc_abi(void);
 
 BR_API const char *br_mpc_error_text(br_mpc_error error);
 BR_API const char *br_mpc_status_text(br_mpc_status status);
-BR_API const char *br_mpc_model_name(void);
 
 #ifdef __cplusplus
 }

@@ -11,14 +11,6 @@
 #define JUMP_BY 0.01     /* and so much more */
 #define LEAST_BUDGET 0.1 /* what a step gets however late its cycle began: share of the budget */
 
-#define LEAST_STAGES 0.5 /* of a transition by which the model is judged; ... */
-#define MOST_STAGES 2    /* ... and at most */
-
-/* What the car has done since a measured state, for br_mpc_observe. */
-typedef struct {
-    double duration_s, x[BR_NX], u[BR_NU]; /* 0: nothing yet; mean input */
-} br_shown;
-
 struct br_cycle {
     br_controller controller;
     br_mpc *mpc; /* the compiled controller's, and what its last step reported; NULL: another's */
@@ -163,35 +155,6 @@ static void forget_delay(br_cycle *cycle) {
         settings->compensation == BR_COMPENSATION_FIXED ? settings->delay_s : 0;
 }
 
-/* Shows the compiled controller what the car does from stage to stage: states that come more often
- * are taken together, and where one is lost, or the mean input is not known, it begins anew. A
- * standing car shows nothing. */
-static void observe_transition(br_cycle *cycle, const br_measured *before,
-                               const br_measured *state) {
-    br_shown *shown = &cycle->shown;
-    const double step_s = state->time_s - before->time_s;
-    const int next = (uint64_t)state->seq == (uint64_t)before->seq + 1;
-    if (!cycle->mpc || !next || !state->averaged || !(step_s > 0)) {
-        shown->duration_s = 0;
-        return;
-    }
-    if (shown->duration_s == 0) {
-        memcpy(shown->x, before->x, sizeof shown->x);
-        memset(shown->u, 0, sizeof shown->u);
-    }
-    const double duration_s = shown->duration_s + step_s;
-    for (int i = 0; i < BR_NU; ++i)
-        shown->u[i] += (state->u_applied[i] - shown->u[i]) * step_s / duration_s;
-    shown->duration_s = duration_s;
-    if (duration_s < LEAST_STAGES * BR_TS) return;
-    shown->duration_s = 0;
-    if (duration_s <= MOST_STAGES * BR_TS &&
-        fabs(shown->x[BR_INDEX_VX]) > cycle->settings.standing_mps) {
-        const int stage = fabs(duration_s - BR_TS) < STAGE_ROUNDING * BR_TS;
-        br_mpc_observe(cycle->mpc, shown->x, shown->u, stage ? BR_TS : duration_s, state->x);
-    }
-}
-
 /* What counts of the newest state: what was measured, or the prediction where that is doubtful. */
 static void believe(br_cycle *cycle, double interval_s) {
     br_counters *counters = &cycle->counters;
@@ -227,7 +190,7 @@ br_reception br_cycle_observe(br_cycle *cycle, const br_measured *state) {
     if (doubted || cycle->counters.fault)
         cycle->shown.duration_s = 0;
     else if (!begins)
-        observe_transition(cycle, &before, state);
+        br_shown_observe(&cycle->shown, cycle->mpc, &cycle->settings, &before, state);
     br_delay_observe(&cycle->delay, &cycle->settings, state, &cycle->counters.delay_s);
     return BR_STATE_NEW;
 }
@@ -435,14 +398,6 @@ br_mpc_error br_cycle_decide(br_cycle *cycle, const br_environment *environment,
     return BR_OK;
 }
 
-br_mpc_error br_cycle_answer(br_cycle *cycle, const br_measured *state,
-                             const br_environment *environment, double decided_at_s,
-                             double budget_s, double spent_s, br_decision *decision) {
-    if (!cycle || !state || !decision) return BR_ERROR_NULL;
-    if (br_cycle_observe(cycle, state) != BR_STATE_NEW) return BR_ERROR_STATE;
-    return br_cycle_decide(cycle, environment, decided_at_s, budget_s, spent_s, decision);
-}
-
 br_mpc_error br_cycle_brake(const br_cycle *cycle, br_braking *braking) {
     if (!cycle || !braking) return BR_ERROR_NULL;
     if (!cycle->acting || !cycle->controller.steer) return BR_ERROR_NOT_READY;
@@ -454,22 +409,6 @@ br_mpc_error br_cycle_brake(const br_cycle *cycle, br_braking *braking) {
     memcpy(from.u, cycle->decision.u, sizeof from.u);
     br_braking_plan(&from, braking);
     return BR_OK;
-}
-
-const char *br_cycle_fault_text(br_fault fault) {
-    static const char *const texts[] = {
-        [BR_FAULT_NONE] = "the state is believed",
-        [BR_FAULT_FROZEN] = "it is equal to the state before, though the car moves",
-        [BR_FAULT_TIME] = "its time does not follow from its number",
-        [BR_FAULT_POSITION] = "the position does not follow from the velocities",
-        [BR_FAULT_HEADING] = "the heading does not follow from the yaw rate",
-        [BR_FAULT_VELOCITY] = "the velocity changes faster than tyres can make it",
-        [BR_FAULT_YAW_RATE] = "the yaw rate changes faster than tyres can make it",
-        [BR_FAULT_STEERING] = "the steering angle does not follow from the steering rate",
-        [BR_FAULT_ELSEWHERE] =
-            "the states agree with each other again, but not with where the car must be",
-    };
-    return (unsigned)fault < sizeof texts / sizeof texts[0] ? texts[fault] : "unknown fault";
 }
 
 /* A car is being driven: a step has been made, and no halt since. */

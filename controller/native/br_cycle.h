@@ -19,6 +19,16 @@ void br_stream_init(br_stream *stream);
 br_reception br_stream_accept(br_stream *stream, const br_measured *state, br_counters *counters);
 int br_stream_forget(br_stream *stream, br_counters *counters);
 
+/* --- br_state.c: what the compiled controller is shown, for br_mpc_observe --- */
+
+typedef struct {
+    double duration_s, x[BR_NX], u[BR_NU]; /* since a measured state; 0: nothing yet; mean input */
+} br_shown;
+
+/* mpc NULL: another controller, which is shown nothing. */
+void br_shown_observe(br_shown *shown, br_mpc *mpc, const br_driving *settings,
+                      const br_measured *before, const br_measured *state);
+
 /* --- br_state.c: the state at the moment from which the new input will act --- */
 
 #define BR_SENT 1024    /* inputs remembered: two seconds at 500 Hz */

@@ -1,5 +1,5 @@
-/* Received states: which of them count, whether what they say can be believed, and the state at the
- * moment from which the new input will act. */
+/* Received states: which of them count, whether what they say can be believed, what the controller
+ * is shown of them, and the state at the moment from which the new input will act. */
 #include <math.h>
 #include <string.h>
 
@@ -297,6 +297,54 @@ br_fault br_monitor_check(br_monitor *monitor, const br_driving *settings,
     memcpy(state->x, monitor->x, sizeof monitor->x);
     state->time_s = monitor->time_s;
     return monitor->distrusted;
+}
+
+const char *br_cycle_fault_text(br_fault fault) {
+    static const char *const texts[] = {
+        [BR_FAULT_NONE] = "the state is believed",
+        [BR_FAULT_FROZEN] = "it is equal to the state before, though the car moves",
+        [BR_FAULT_TIME] = "its time does not follow from its number",
+        [BR_FAULT_POSITION] = "the position does not follow from the velocities",
+        [BR_FAULT_HEADING] = "the heading does not follow from the yaw rate",
+        [BR_FAULT_VELOCITY] = "the velocity changes faster than tyres can make it",
+        [BR_FAULT_YAW_RATE] = "the yaw rate changes faster than tyres can make it",
+        [BR_FAULT_STEERING] = "the steering angle does not follow from the steering rate",
+        [BR_FAULT_ELSEWHERE] =
+            "the states agree with each other again, but not with where the car must be",
+    };
+    return (unsigned)fault < sizeof texts / sizeof texts[0] ? texts[fault] : "unknown fault";
+}
+
+/* --- what the compiled controller is shown of the car --- */
+
+#define LEAST_STAGES 0.5 /* of a transition by which the model is judged; ... */
+#define MOST_STAGES 2    /* ... and at most */
+
+/* Shows the compiled controller what the car does from stage to stage: states that come more often
+ * are taken together, and where one is lost, or the mean input is not known, it begins anew. A
+ * standing car shows nothing. */
+void br_shown_observe(br_shown *shown, br_mpc *mpc, const br_driving *settings,
+                      const br_measured *before, const br_measured *state) {
+    const double step_s = state->time_s - before->time_s;
+    const int next = (uint64_t)state->seq == (uint64_t)before->seq + 1;
+    if (!mpc || !next || !state->averaged || !(step_s > 0)) {
+        shown->duration_s = 0;
+        return;
+    }
+    if (shown->duration_s == 0) {
+        memcpy(shown->x, before->x, sizeof shown->x);
+        memset(shown->u, 0, sizeof shown->u);
+    }
+    const double duration_s = shown->duration_s + step_s;
+    for (int i = 0; i < BR_NU; ++i)
+        shown->u[i] += (state->u_applied[i] - shown->u[i]) * step_s / duration_s;
+    shown->duration_s = duration_s;
+    if (duration_s < LEAST_STAGES * BR_TS) return;
+    shown->duration_s = 0;
+    if (duration_s <= MOST_STAGES * BR_TS && fabs(shown->x[BR_INDEX_VX]) > settings->standing_mps) {
+        const int stage = fabs(duration_s - BR_TS) < STAGE_ROUNDING * BR_TS;
+        br_mpc_observe(mpc, shown->x, shown->u, stage ? BR_TS : duration_s, state->x);
+    }
 }
 
 /* --- delay compensation: the state at the moment from which the new input will act ---

@@ -173,7 +173,8 @@ FMI(Status) fmu_model_step(fmu_instance *instance, double h) {
     const FMI(Status) status = take_parameters(instance);
     const br_measured state = measured(instance);
     br_decision decision;
-    if (br_cycle_answer(c->cycle, &state, &around, v[FMU_V_time], 0, 0, &decision))
+    if (br_cycle_observe(c->cycle, &state) != BR_STATE_NEW ||
+        br_cycle_decide(c->cycle, &around, v[FMU_V_time], 0, 0, &decision))
         return FMU_ERROR(instance, "controller: the control cycle refuses the state");
     set_outputs(instance, &decision);
     return status;
