@@ -12,6 +12,7 @@ import os
 import shutil
 import tempfile
 from collections.abc import Callable
+from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -290,17 +291,7 @@ def _manifest(
             states=[one.name for one in problem.states],
             inputs=[one.name for one in problem.inputs],
             stage_parameters=[one.name for one in problem.stage_parameters],
-            parameters=[
-                ParameterInfo(
-                    name=one.name,
-                    unit=one.unit,
-                    text=one.text,
-                    low=one.low,
-                    high=one.high,
-                    positive=one.positive,
-                )
-                for one in problem.parameters
-            ],
+            parameters=[ParameterInfo(**asdict(one)) for one in problem.parameters],
             features=list(problem.features),
             outputs=problem.outputs,
         ),

@@ -16,9 +16,9 @@ import bayesrace.codegen.build as build_module
 from bayesrace.cache import cache_folder
 from bayesrace.codegen.build import build, build_hash, generate
 from bayesrace.codegen.compiler import FLAGS, CompileError, Compiler, find_compiler
+from bayesrace.codegen.problems.driving import linearise_function
 from bayesrace.codegen.problems.problem import Problem
 from bayesrace.codegen.settings import BuildSettings
-from bayesrace.codegen.stage import linearise_function
 from bayesrace.controller.driver import (
     DOUBTED,
     HALTED,

@@ -20,9 +20,8 @@ from bayesrace.errors import InputError
 from bayesrace.plant.guard import PlantGuard
 from bayesrace.vehicles import CarParameters, get_car
 from bayesrace.vehicles.models import STATES
-from tests.car_fmu import packed_car, unpacked_car
+from tests.car_fmu import Kind, Version, built_in, commands, driven, packed_car, slave, unpacked_car
 from tests.cars import with_numbers
-from tests.fmu_exports import Kind, Version, built_in, commands, driven, slave
 from tests.fmu_master import Slave
 
 etree: Any = pytest.importorskip("lxml.etree")

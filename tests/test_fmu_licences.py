@@ -9,8 +9,7 @@ from bayesrace.codegen.fmu import car_fmu
 from bayesrace.codegen.fmu.archive import licence_files, third_parties
 from bayesrace.codegen.fmu.build import get_platform
 from bayesrace.vehicles import get_car
-from tests.car_fmu import packed_car
-from tests.fmu_exports import Kind, Version
+from tests.car_fmu import Kind, Version, packed_car
 from tests.fmu_lockstep import Exported, exported_controllers  # noqa: F401 - a fixture
 
 NOTICES = (Path(__file__).parents[1] / "THIRD_PARTY_NOTICES.md").read_text()

@@ -9,7 +9,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from bayesrace.arrays import Floats
-from bayesrace.codegen.stage import advance_function, linearise_function
+from bayesrace.codegen.problems.driving import advance_function, linearise_function
 from bayesrace.controller.native_step import NativeStep
 from bayesrace.errors import InputError
 from bayesrace.gp.expression import mean_function

@@ -22,9 +22,9 @@ from bayesrace.codegen.problems.problem import (
     Row,
     State,
     Symbols,
+    linearised,
 )
 from bayesrace.codegen.settings import BuildSettings
-from bayesrace.codegen.stage import linearised
 from bayesrace.controller.native_step import NativeProblem, StepStatus
 from bayesrace.errors import InputError
 from bayesrace.integrators import Discretisation

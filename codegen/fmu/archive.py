@@ -22,7 +22,9 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from bayesrace.codegen.fmu.build import (
     FLAGS,
     PLATFORMS,
+    FmuDefinition,
     Platform,
+    Variable,
     arguments,
     fmi_headers,
     get_platform,
@@ -31,7 +33,6 @@ from bayesrace.codegen.fmu.build import (
     sources_of,
     write_sources,
 )
-from bayesrace.codegen.fmu.definition import FmuDefinition, Variable
 from bayesrace.codegen.host_files import HEAD, IDENTITY_BYTES, WEIGHTS_FILE, weights_file
 from bayesrace.errors import InputError
 from bayesrace.files import replacing

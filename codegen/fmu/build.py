@@ -1,4 +1,4 @@
-"""The C of an FMU, and its binaries: the host's by its own compiler, others cross-compiled.
+"""What an FMU is; its C, and its binaries: the host's by its own compiler, others cross-compiled.
 
 The C is the model's, the FMI layer of its version (``native``), FMI's headers, and the generated
 ``fmu_config.h``.
@@ -7,27 +7,113 @@ The C is the model's, the FMI layer of its version (``native``), FMI's headers, 
 import hashlib
 import platform
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass, field
 from importlib.util import find_spec
-from math import isfinite
+from math import inf, isfinite
 from pathlib import Path
-from typing import Final
+from typing import Final, Literal
 from uuid import UUID
 
 import fmpy
 
 from bayesrace.codegen.compiler import Compiler, find_compiler
-from bayesrace.codegen.fmu.definition import NATIVE, FmuDefinition, Variable
 from bayesrace.errors import InputError
 from bayesrace.processes import RUN_MODULE
 
 __all__ = [
-    "FLAGS", "PLATFORMS", "Platform", "arguments", "fmi_headers", "get_platform", "host_platform",
-    "linked_files", "sources_of", "write_sources",
+    "FLAGS", "NATIVE", "PLATFORMS", "FmuDefinition", "Platform", "Variable", "arguments",
+    "fmi_headers", "get_platform", "host_platform", "linked_files", "sources_of", "write_sources",
 ]  # fmt: skip
+
+NATIVE: Final = Path(__file__).parent / "native"
+"""The hand-written C."""
 
 FLAGS: Final = ("-std=gnu11", "-O2", "-ffp-contract=off", "-fvisibility=hidden")
 """Portable, and the same arithmetic on every platform: no fused multiply-add."""
+
+
+@dataclass(frozen=True)
+class Variable:
+    """One scalar variable; its value reference is its place in the definition.
+
+    An input, a parameter, a state and an output that may be set before the run have a ``start``;
+    an output without one is calculated. In C the variable is ``instance->value[FMU_V_<name>]``.
+    """
+
+    name: str
+    causality: Literal["input", "output", "parameter", "local", "independent"]
+    description: str
+    _: KW_ONLY
+    kind: Literal["real", "integer", "boolean"] = "real"
+    unit: str | None = None
+    """Modelica style, such as ``m/s`` or ``kg.m2``; ``1`` for a pure number; real ones only."""
+    start: float | None = None
+    min: float = -inf
+    max: float = inf
+    exclusive: bool = False
+    """The value must not be equal to ``min`` or ``max`` either (FMI cannot say that)."""
+    tunable: bool = False
+    """A parameter that may also be set during the run (default: until initialisation ends)."""
+    nominal: float | None = None
+    derivative_of: str | None = None
+    """Model Exchange: the state that this variable is the derivative of."""
+    dependencies: tuple[str, ...] | None = ()
+    """Outputs and derivatives: variables that it depends on directly (None: on all)."""
+
+    @property
+    def variability(self) -> Literal["continuous", "discrete", "fixed", "tunable"]:
+        """As FMI calls it."""
+        if self.causality == "parameter":
+            return "tunable" if self.tunable else "fixed"
+        return "continuous" if self.kind == "real" else "discrete"
+
+
+TIME: Final = Variable("time", "independent", "simulation time", unit="s")
+
+
+@dataclass(frozen=True, kw_only=True)
+class FmuDefinition:
+    """An FMU of FMI 2.0 or 3.0, ready for :func:`bayesrace.codegen.fmu.pack`.
+
+    ``name``: shown to people; ``identifier``: of the binaries, in C; ``description``: one line.
+    """
+
+    name: str
+    identifier: str
+    description: str
+    version: Literal[2, 3]
+    variables: tuple[Variable, ...]
+    """In the order of their value references. Of Model Exchange: the states first, at the end their
+    derivatives in the same order."""
+    sources: Mapping[str, bytes]
+    """C files that implement the model of ``fmu.h``, with headers, by the path below ``sources/``.
+    A static library of the host platform (``*.a``) is linked; then no other can be built for."""
+    flags: tuple[str, ...] = ()
+    """Compiler flags after those of every FMU."""
+    constants: Mapping[str, float] = field(default_factory=dict)
+    """Further macros of ``fmu_config.h``."""
+    resources: Mapping[str, bytes] = field(default_factory=dict)
+    """Files of the ``resources/`` folder."""
+    documentation: str = ""
+    """Of the documentation page, HTML."""
+    default_step_s: float = 0.02
+    serialises: bool = True
+    """A saved state can become bytes for another instance: model memory holds no pointers."""
+
+    @property
+    def states(self) -> tuple[str, ...]:
+        """Continuous states: some if the FMU is for Model Exchange, else none."""
+        return tuple(v.derivative_of for v in self.variables if v.derivative_of is not None)
+
+    @property
+    def all_variables(self) -> tuple[Variable, ...]:
+        """The variables, and time as the last."""
+        return (*self.variables, TIME)
+
+    @property
+    def libraries(self) -> bool:
+        """Whether static libraries are among the sources."""
+        return any(name.endswith(".a") for name in self.sources)
 
 
 @dataclass(frozen=True)
@@ -76,8 +162,7 @@ def host_platform() -> Platform:
 
 
 def get_platform(name: str) -> Platform:
-    """By FMI 3.0 name, or linux64 or win64; InputError naming the known ones."""
-    name = {"linux64": "x86_64-linux", "win64": "x86_64-windows"}.get(name, name)
+    """By the name of FMI 3.0; InputError naming the known ones."""
     if name not in PLATFORMS:
         raise InputError(f"unknown platform '{name}'; known: {', '.join(PLATFORMS)}")
     return PLATFORMS[name]

@@ -13,7 +13,7 @@ from typing import Any, Final, Literal
 
 import casadi as ca
 
-from bayesrace.codegen.fmu.definition import NATIVE, FmuDefinition, Variable
+from bayesrace.codegen.fmu.build import NATIVE, FmuDefinition, Variable
 from bayesrace.errors import InputError
 from bayesrace.integrators import PLANT_SCHEME, PLANT_SUBSTEP_HZ, SCHEMES
 from bayesrace.vehicles import models

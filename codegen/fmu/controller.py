@@ -13,8 +13,8 @@ from numpy.typing import ArrayLike
 
 from bayesrace.codegen.build import HOST
 from bayesrace.codegen.compiler import FLAGS
+from bayesrace.codegen.fmu.build import NATIVE, FmuDefinition, Variable
 from bayesrace.codegen.fmu.car import STATE
-from bayesrace.codegen.fmu.definition import NATIVE, FmuDefinition, Variable
 from bayesrace.codegen.host_files import PATH_FILE, WEIGHTS_FILE, path_file, weights_file
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import GpWeights

@@ -13,14 +13,26 @@ from collections.abc import Callable
 
 import casadi as ca
 
-from bayesrace.codegen.problems.problem import Input, Parameter, Problem, Row, State, Symbols
-from bayesrace.codegen.stage import advance_function, linearise_function
+from bayesrace.codegen.problems.problem import (
+    Input,
+    Parameter,
+    Problem,
+    Row,
+    State,
+    Symbols,
+    derivatives,
+    linearised,
+    with_arguments,
+)
 from bayesrace.integrators import Discretisation
 from bayesrace.vehicles.models import STATES, Model, top_command
 from bayesrace.vehicles.parameters import CarParameters
 from bayesrace.vehicles.tuning import Tuning
 
-__all__ = ["REFERENCE", "StateCost", "driving_problem"]
+__all__ = ["REFERENCE", "StateCost", "advance_function", "driving_problem", "linearise_function"]
+
+_NX, _NV, _NE = 7, 9, 3
+_NW = _NV + _NE
 
 StateCost = Callable[[ca.SX, dict[str, ca.SX], dict[str, ca.SX], ca.SX], ca.SX]
 """Of the state, the stage's and the run-time parameters by name, and :attr:`Symbols.last`."""
@@ -92,6 +104,67 @@ def _constants(car: CarParameters) -> dict[str, float]:
     numbers = {f"{n}_{key}": value for n, one in sections.items() for key, value in one}
     numbers["wheelbase_m"] = car.wheelbase_m
     return numbers | {f"caution_{key}": value for key, value in tuning.caution.pace}
+
+
+def _composed(model: Model, discretisation: Discretisation) -> tuple[ca.Function, ca.Function]:
+    """``w -> (F, J)`` and ``(w, lambda) -> H`` for many sub-steps.
+
+    By the chain rule, so that code grows by calls. With S_i = d [x_i; u] / d [x; u] and lambda_i
+    the costate of sub-step i:
+
+        J = d x_n / d v,    H = sum_i S_i' H_i(lambda_i) S_i,    lambda_i = A_i' lambda_{i+1}
+
+    e enters at the end of the step: its columns of J are unit vectors, those of H zero.
+    """
+    n = discretisation.substeps
+    one = discretisation.model_copy(update={"step_s": discretisation.step_s / n, "substeps": 1})
+    v = ca.SX.sym("v", _NV)
+    forward, second = derivatives(v, one.discretise(model)(v[:_NX], v[_NX:]), "_substep")
+    w, lam = ca.MX.sym("w", _NW), ca.MX.sym("lambda", _NX)
+    u = w[_NX:_NV]
+    states, jacobians = [w[:_NX]], []
+    for _ in range(n):
+        x_next, jacobian = forward(ca.vertcat(states[-1], u))
+        states.append(x_next)
+        jacobians.append(jacobian)
+    hold_u = ca.horzcat(ca.MX.zeros(2, _NX), ca.MX.eye(2))
+    sensitivities = [ca.MX.eye(_NV)]
+    for jacobian in jacobians:
+        sensitivities.append(ca.vertcat(jacobian @ sensitivities[-1], hold_u))
+    costate = lam
+    hessian = ca.MX(_NV, _NV)
+    for i in reversed(range(n)):
+        curvature = second(ca.vertcat(states[i], u), costate)
+        hessian += sensitivities[i].T @ curvature @ sensitivities[i]
+        costate = jacobians[i][:, :_NX].T @ costate
+    enters = ca.vertcat(ca.DM.zeros(3, _NE), ca.DM.eye(_NE), ca.DM.zeros(1, _NE))
+    jacobian = ca.horzcat(sensitivities[n][:_NX, :], enters)
+    hessian = ca.diagcat(hessian, ca.DM.zeros(_NE, _NE))
+    x_next = states[-1] + enters @ w[_NV:]
+    options = {"cse": True}
+    return (
+        ca.Function("br_composed", [w], [x_next, ca.densify(jacobian)], options),
+        ca.Function("br_composed_second", [w, lam], [ca.densify(hessian)], options),
+    )
+
+
+def linearise_function(model: Model, discretisation: Discretisation) -> ca.Function:
+    """:func:`linearised` of the discretised model.
+
+    e (3) is the residual's mean, added to vx, vy, omega at the end of the step.
+    """
+    if discretisation.substeps > 1 and discretisation.pose == "integrated":
+        return with_arguments(*_composed(model, discretisation), _NX, _NV - _NX, _NE)
+    return linearised(discretisation.corrected(model))
+
+
+def advance_function(model: Model, discretisation: Discretisation) -> ca.Function:
+    """``(x, u, e, h) -> x_next``: the model over h [s], e what the residual adds within it."""
+    over = discretisation.over(model)
+    x, u, e, h = (ca.SX.sym(name, n) for name, n in (("x", _NX), ("u", 2), ("e", _NE), ("h", 1)))
+    x_next = ca.densify(over(x, u, e, h))
+    names = ["x", "u", "e", "h"]
+    return ca.Function("br_advance", [x, u, e, h], [x_next], names, ["x_next"], {"cse": True})
 
 
 def driving_problem(

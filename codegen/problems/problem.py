@@ -17,7 +17,10 @@ from typing import Any, Final
 
 import casadi as ca
 
-__all__ = ["NO_BOUND", "Input", "Parameter", "Problem", "Row", "State", "Symbols"]
+__all__ = [
+    "NO_BOUND", "Input", "Parameter", "Problem", "Row", "State", "Symbols", "derivatives",
+    "linearised", "with_arguments",
+]  # fmt: skip
 
 NO_BOUND: Final = 1e20
 """A bound of a row that is none."""
@@ -134,7 +137,7 @@ class Problem:
     f: ca.Function
     """The discretised model, (x, u, e) -> x_next; e is the residual's mean."""
     linearise: ca.Function
-    """(x, u, e, lambda) -> f, its transposed Jacobian, Hessian of lambda' f; see stage.py."""
+    """(x, u, e, lambda) -> f, its transposed Jacobian, Hessian of lambda' f; see `linearised`."""
     advance: ca.Function
     """(x, u, e, h) -> x_next: the model over h [s]."""
     cost: ca.SX
@@ -227,3 +230,44 @@ class Problem:
         if wanted in states:
             return states.index(wanted)
         return [one.name for one in self.inputs].index(wanted)
+
+
+def linearised(f: ca.Function) -> ca.Function:
+    """``(x, u, e, lambda) -> (F, J', H)`` of any f(x, u, e), all dense.
+
+    With w = [x; u; e], J' is the transposed Jacobian (column major, so C reads it as J row major)
+    and H the Hessian of lambda' F. The chain through e, which depends on x and u, is closed
+    natively (controller/native/br_stage.c).
+    """
+    nx, nu, ne = (f.size1_in(i) for i in range(3))
+    nv = nx + nu
+    w = ca.SX.sym("w", nv + ne)
+    return with_arguments(*derivatives(w, f(w[:nx], w[nx:nv], w[nv:]), ""), nx, nu, ne)
+
+
+def derivatives(v: ca.SX, x_next: ca.SX, suffix: str) -> tuple[ca.Function, ca.Function]:
+    """``v -> (x_next, J)`` and ``(v, lambda) -> H``: apart, because H is often not needed."""
+    lam = ca.SX.sym("lambda", x_next.numel())
+    jacobian = ca.densify(ca.jacobian(x_next, v))
+    hessian = ca.densify(ca.hessian(ca.dot(lam, x_next), v)[0])
+    options = {"cse": True}
+    return (
+        ca.Function(f"br_forward{suffix}", [v], [x_next, jacobian], options),
+        ca.Function(f"br_second{suffix}", [v, lam], [hessian], options),
+    )
+
+
+def with_arguments(
+    forward: ca.Function, second: ca.Function, nx: int, nu: int, ne: int
+) -> ca.Function:
+    """The same with x, u and e apart, and the Jacobian transposed."""
+    x, u, e = ca.MX.sym("x", nx), ca.MX.sym("u", nu), ca.MX.sym("e", ne)
+    lam, w = ca.MX.sym("lambda", nx), ca.vertcat(x, u, e)
+    (x_next, jacobian), hessian = forward(w), second(w, lam)
+    return ca.Function(
+        "br_linearise",
+        [x, u, e, lam],
+        [x_next, jacobian.T, hessian],
+        ["x", "u", "e", "lambda"],
+        ["x_next", "jacobian_transposed", "hessian"],
+    )

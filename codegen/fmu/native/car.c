@@ -79,7 +79,7 @@ static void guard(const double *v, double duration, double u[2]) {
     u[1] = clipped(rate, -fastest, fastest);
 }
 
-FMI(Status) fmu_model_step(fmu_instance *car, double h) {
+fmu_status fmu_model_step(fmu_instance *car, double h) {
     double *v = car->value, x[NX], next[NX], u[2];
     memcpy(x, &v[FMU_V_x], sizeof x);
     guard(v, h, u);
@@ -99,7 +99,7 @@ FMI(Status) fmu_model_step(fmu_instance *car, double h) {
     memcpy(&v[FMU_V_x], x, sizeof x);
     v[FMU_V_d_applied] = u[0];
     v[FMU_V_delta_rate_applied] = u[1];
-    return FMI(OK);
+    return FMU_OK;
 }
 
 #else

@@ -73,7 +73,7 @@ static br_mpc_error use_parameters(controller *c, const double *v) {
 
 /* Uses what has been set since the step before. Each parameter is within its bounds; those that do
  * not fit together are given up: step and FMU go on with the parameters of the step before. */
-static FMI(Status) take_parameters(fmu_instance *instance) {
+static fmu_status take_parameters(fmu_instance *instance) {
 #define ROLE(name, kind, role, ...) FMU_##role,
     static const fmu_role roles[] = {FMU_VARIABLES(ROLE)};
 #undef ROLE
@@ -82,12 +82,12 @@ static FMI(Status) take_parameters(fmu_instance *instance) {
     const br_mpc_error error = use_parameters(c, v);
     if (!error) {
         memcpy(c->used, v, sizeof c->used);
-        return FMI(OK);
+        return FMU_OK;
     }
     use_parameters(c, c->used);
     for (int i = 0; i < FMU_VALUES; i++)
         if (roles[i] == FMU_TUNABLE) v[i] = c->used[i];
-    return fmu_note(instance, FMI(Warning), UNUSABLE "; the parameters before stay in use",
+    return fmu_note(instance, FMU_WARNING, UNUSABLE "; the parameters before stay in use",
                     br_mpc_error_text(error));
 }
 
@@ -164,13 +164,13 @@ static void set_outputs(fmu_instance *instance, const br_decision *decision) {
 #undef COPY
 }
 
-FMI(Status) fmu_model_step(fmu_instance *instance, double h) {
+fmu_status fmu_model_step(fmu_instance *instance, double h) {
     controller *c = instance->model;
     const double *v = instance->value;
-    if (!due(c, v[FMU_V_time], v[FMU_V_period])) return FMI(OK);
+    if (!due(c, v[FMU_V_time], v[FMU_V_period])) return FMU_OK;
     br_environment around = {v[FMU_V_speed_limit], v[FMU_V_speed_limit_rate]};
     if (around.speed_limit_mps >= NO_SPEED_LIMIT) around.speed_limit_mps = INFINITY;
-    const FMI(Status) status = take_parameters(instance);
+    const fmu_status status = take_parameters(instance);
     const br_measured state = measured(instance);
     br_decision decision;
     if (br_cycle_observe(c->cycle, &state) != BR_STATE_NEW ||

@@ -34,6 +34,10 @@
 #define FMI(name) fmi3##name
 #endif
 
+typedef FMI(Status) fmu_status;
+#define FMU_OK FMI(OK)
+#define FMU_WARNING FMI(Warning)
+
 #if defined(__GNUC__)
 #pragma GCC diagnostic ignored "-Wunused-parameter" /* FMI passes more than these FMUs need */
 #else
@@ -54,7 +58,7 @@ typedef struct fmu_saved fmu_saved;
 typedef struct fmu_instance fmu_instance;
 
 /* Passes a message to the importer's logger; category: "logStatusError" ... */
-typedef void fmu_report(const fmu_instance *instance, FMI(Status) status, const char *category,
+typedef void fmu_report(const fmu_instance *instance, fmu_status status, const char *category,
                         const char *text);
 
 struct fmu_instance {
@@ -76,8 +80,8 @@ struct fmu_instance {
 
 /* Sends a message (printf format) with the status that the call is about to return, to the
  * importer's log. Returns the status. */
-__attribute__((format(printf, 3, 4))) static inline FMI(Status)
-    fmu_note(const fmu_instance *instance, FMI(Status) status, const char *format, ...) {
+__attribute__((format(printf, 3, 4))) static inline fmu_status
+fmu_note(const fmu_instance *instance, fmu_status status, const char *format, ...) {
     static const char *const categories[] = {"logStatusOK", "logStatusWarning", "logStatusDiscard",
                                              "logStatusError"};
     char text[512];
@@ -90,7 +94,7 @@ __attribute__((format(printf, 3, 4))) static inline FMI(Status)
 }
 
 #define FMU_ERROR(instance, ...) fmu_note(instance, FMI(Error), __VA_ARGS__)
-#define fmu_refuse(...) (FMU_ERROR(__VA_ARGS__) == FMI(OK)) /* false, after the message */
+#define fmu_refuse(...) (FMU_ERROR(__VA_ARGS__) == FMU_OK) /* false, after the message */
 
 typedef enum {
     FMU_CALCULATED, /* never set from outside */
@@ -113,7 +117,7 @@ bool fmu_model_initialise(fmu_instance *instance);
 
 /* Co-Simulation: from time to time + h, 0 < h <= 1000; the caller advances the time. Returns OK,
  * after fmu_note Warning, or after fmu_refuse Error, which ends the simulation. */
-FMI(Status) fmu_model_step(fmu_instance *instance, double h);
+fmu_status fmu_model_step(fmu_instance *instance, double h);
 
 /* Model Exchange: derivatives [FMU_STATES] of the states at the instance's values. */
 void fmu_model_derivatives(const fmu_instance *instance, double *dx);
