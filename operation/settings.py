@@ -122,8 +122,7 @@ class RaceSettings(PreparationSettings):
         "", description="race track: name, random:SEED, random10:SEED or CSV file; empty: the car's"
     )
     line: Annotated[Path | None, Option("--raceline")] = Field(
-        None,
-        description="racing line to drive, as 'bayesrace raceline' writes it; None: computed",
+        None, description="racing line to drive, as 'bayesrace raceline' writes it; None: computed"
     )
     laps: int = Field(2, ge=1, le=100, description="laps of a controller, the first from rest")
     progress_drives: int | None = Field(

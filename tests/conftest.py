@@ -288,11 +288,7 @@ def drive(
 
 
 def ready(
-    artefact: Path,
-    car: CarParameters,
-    weights: GpWeights,
-    circuit: Circuit,
-    settings: MpcSettings,
+    artefact: Path, car: CarParameters, weights: GpWeights, circuit: Circuit, settings: MpcSettings
 ) -> NativeStep:
     """A GP controller on the circuit."""
     step = NativeStep(artefact, car, settings)

@@ -60,20 +60,17 @@ class Trajectory:
     @property
     def x(self) -> Floats:
         """True states, shape (n, 7)."""
-        x: Floats = self.moments["x"]
-        return x
+        return np.asarray(self.moments["x"])
 
     @property
     def u(self) -> Floats:
         """Inputs that acted from each state to the next, shape (max(n - 1, 0), 2)."""
-        acted: Floats = self.moments["u_applied"][1:]
-        return acted
+        return np.asarray(self.moments["u_applied"][1:])
 
     @property
     def time_s(self) -> Floats:
         """Plant time of the states, shape (n,)."""
-        time_s: Floats = self.moments["time_s"]
-        return time_s
+        return np.asarray(self.moments["time_s"])
 
     @cached_property
     def slip_rad(self) -> Floats:
@@ -95,8 +92,7 @@ class Trajectory:
     @property
     def lap(self) -> NDArray[np.int64]:
         """Start-line crossings up to each state, shape (n,)."""
-        lap: NDArray[np.int64] = self.moments["lap"]
-        return lap
+        return np.asarray(self.moments["lap"])
 
 
 @dataclass(frozen=True)

@@ -129,10 +129,6 @@ class DrivenRun:
         off = depth[depth > 0]
         return int(whole.sum()) * places.shape[1] + len(off), float(np.max(off, initial=0.0))
 
-    def digest(self) -> str:
-        """sha256 of the trajectory up to the first sample after the last counted crossing."""
-        return trajectory_digest(self.record.x, self.laps)
-
     def result(self, laps: int = 0, limit_s: Mapping[str, float] | None = None) -> LapResult:
         """The run in numbers; ``laps``: that it was to have, 0: any number; ``limit_s``: the limits
         of a standing and of a flying lap."""
@@ -168,7 +164,7 @@ class DrivenRun:
             passed=verdict.passed,
             verdict=verdict.text,
             weights_version=self.record.weights_version,
-            trajectory_sha256=self.digest(),
+            trajectory_sha256=trajectory_digest(self.record.x, self.laps),
             samples=len(self.record.truth),
             ended=self.record.ended,
             refused=self.record.plan.refused,

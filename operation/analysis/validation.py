@@ -17,14 +17,7 @@ from bayesrace.operation.analysis.results import GpMetrics, gp_metrics
 from bayesrace.operation.terminal import UNCERTAIN
 from bayesrace.vehicles import CarParameters, get_car
 
-__all__ = [
-    "DRIFTS",
-    "HorizonResult",
-    "Spread",
-    "Validated",
-    "ValidationResult",
-    "validate_weights",
-]
+__all__ = ["DRIFTS", "HorizonResult", "Spread", "Validated", "ValidationResult", "validate_weights"]
 
 DRIFTS: Final = "position_m", "heading_rad", "vx_mps", "vy_mps", "omega_radps"
 """Errors of a prediction, with their units."""
@@ -122,10 +115,7 @@ def validate_weights(
         if len(plain) == 0:
             return None
         return HorizonResult(
-            steps=steps,
-            predictions=len(plain),
-            nominal=_drift(plain),
-            corrected=_drift(corrected),
+            steps=steps, predictions=len(plain), nominal=_drift(plain), corrected=_drift(corrected)
         )
 
     result = ValidationResult(

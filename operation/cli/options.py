@@ -108,8 +108,7 @@ ENDPOINT: Final = value(
 )
 GIVEN_LINE: Final = value(f"Racing line to drive, {_RACELINE}", shown="computed")
 LOW_LATENCY: Final = flag(
-    "--low-latency",
-    "Send in the calling thread: in lockstep only, on both plant and controller.",
+    "--low-latency", "Send in the calling thread: in lockstep only, on both plant and controller."
 )
 MPC: Final = value("OCP settings (JSON): controller/settings.py.", None, "--settings")
 PARENT_PID: Final = value("End when this parent ends.", hidden=True)

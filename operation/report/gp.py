@@ -6,7 +6,6 @@ from typing import Final
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
 from bayesrace.arrays import Flags, Floats
@@ -104,13 +103,11 @@ def _track_figure(
         corners += edges
         draw_edges(axes, *edges)
     uncertain = validation.uncertain(threshold)
-    segments = np.stack([xy, dataset.x_next[:, :2]], axis=1)
+    gaps = np.full_like(xy, np.nan)  # from one sample's step to the next
+    steps = np.stack([xy, dataset.x_next[:, :2], gaps], axis=1)
     large = f"largest sigma > {threshold:g}"
-    for rows, colour, width, label in (
-        (~uncertain, INK, 1.0, "driven"), (uncertain, WARNING, 2.6, large)
-    ):  # fmt: skip
-        lines = LineCollection(list(segments[rows]), color=colour, linewidth=width, label=label)
-        axes.add_collection(lines)
+    axes.plot(*steps[~uncertain].reshape(-1, 2).T, color=INK, linewidth=1.0, label="driven")
+    axes.plot(*steps[uncertain].reshape(-1, 2).T, color=WARNING, linewidth=2.6, label=large)
     breaks = len(dataset) - 1 - len(unbroken(dataset, 2))
     show_all(axes, np.concatenate(corners))
     title = f"{int(uncertain.sum())} of {len(dataset)} samples with {large}"

@@ -111,10 +111,8 @@ def _calendar(time_ns: int) -> str:
 def _versions(run_dir: Path) -> list[tuple[str, str]]:
     found = [("Python", platform.python_version())]
     for package in _PACKAGES:
-        try:
+        with suppress(PackageNotFoundError):  # run from a checkout that is not installed
             found.append((package, version(package)))
-        except PackageNotFoundError:  # run from a checkout that is not installed
-            continue
     return found + _compilers(run_dir)
 
 
