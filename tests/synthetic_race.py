@@ -16,12 +16,14 @@ from bayesrace.gp.weights import write_weights, zero_weights
 from bayesrace.integrators import PREDICTION
 from bayesrace.log import LogWriter
 from bayesrace.messages import Actuation, Event, Message, State, Telemetry, Truth, encode
+from bayesrace.operation.analysis.race import read_race
+from bayesrace.operation.analysis.results import RaceResult
 from bayesrace.raceline import RaceLine, write_raceline
 from bayesrace.tracks import Track, write_track
 from bayesrace.vehicles import get_car
 from tests.driven import blank
 
-__all__ = ["LAP_S", "LINE_M", "STEP_S", "Drive", "circle", "track", "write_race"]
+__all__ = ["LAP_S", "LINE_M", "STEP_S", "Drive", "analyse", "circle", "track", "write_race"]
 
 
 STEP_S = 0.02
@@ -59,6 +61,11 @@ def circle(angle: Floats, radius: Floats | float) -> Floats:
     x[:, 2] = angle + np.pi / 2
     x[:, 3] = 2.0
     return x
+
+
+def analyse(run_dir: Path) -> RaceResult:
+    """The outcome of a race."""
+    return read_race(run_dir).result
 
 
 @dataclass

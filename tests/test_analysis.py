@@ -17,7 +17,7 @@ from bayesrace.columns import LogColumns
 from bayesrace.errors import InputError
 from bayesrace.limit import LimitLap, write_limit
 from bayesrace.operation.analysis.laps import positions_between, time_laps
-from bayesrace.operation.analysis.race import analyse, read_race
+from bayesrace.operation.analysis.race import read_race
 from bayesrace.operation.analysis.recording import RUN_COLUMNS, read_recording, runs_of
 from bayesrace.operation.analysis.results import LapResult, RaceResult, read_result, write_result
 from bayesrace.operation.report import write_report
@@ -25,7 +25,7 @@ from bayesrace.operation.terminal.tables import COLUMNS, print_table
 from bayesrace.plant.simulator import Simulator, plant_discretisation
 from bayesrace.vehicles import default_car
 from bayesrace.vehicles.models import dynamic
-from tests.synthetic_race import LAP_S, LINE_M, STEP_S, Drive, circle, track, write_race
+from tests.synthetic_race import LAP_S, LINE_M, STEP_S, Drive, analyse, circle, track, write_race
 
 TWO_LAPS: Floats = np.asarray(
     2 * np.pi * STEP_S * np.arange(134) / LAP_S

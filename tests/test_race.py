@@ -20,7 +20,6 @@ from bayesrace.codegen.settings import BuildSettings
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import read_weights, write_weights
 from bayesrace.operation import race as driving
-from bayesrace.operation.analysis.race import analyse
 from bayesrace.operation.analysis.results import RaceResult, read_result
 from bayesrace.operation.drive import RunPlan
 from bayesrace.operation.preparation import Prepared, prepare, updated_weights
@@ -33,7 +32,7 @@ from tests.command_line import Cli, refused
 from tests.foreign_fmu import FOREIGN_MAP, build_foreign_fmu
 from tests.programs import Race, leftovers
 from tests.reference import reference_file
-from tests.synthetic_race import Drive, circle, write_race
+from tests.synthetic_race import Drive, analyse, circle, write_race
 
 pytestmark = pytest.mark.unmeasured
 

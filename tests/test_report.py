@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bayesrace.operation.analysis.race import analyse, read_race
+from bayesrace.operation.analysis.race import read_race
 from bayesrace.operation.analysis.results import RaceResult
 from bayesrace.operation.report import render, write_report
 from bayesrace.operation.report.maps import lap_maps
 from bayesrace.operation.terminal.tables import COLUMNS
 from tests.command_line import Cli, refused
-from tests.synthetic_race import LAP_S, Drive, circle, write_race
+from tests.synthetic_race import LAP_S, Drive, analyse, circle, write_race
 from tests.test_analysis import TWO_LAPS, race
 
 

@@ -15,7 +15,6 @@ from bayesrace.codegen.build import build
 from bayesrace.codegen.settings import BuildSettings
 from bayesrace.controller import pure_pursuit
 from bayesrace.controller.pure_pursuit import DrivingStyle, PurePursuitSettings
-from bayesrace.operation.analysis.race import analyse
 from bayesrace.operation.closed_loop import Driven, built_in_car
 from bayesrace.operation.collect import collect, drive_length_s, training_line, training_margin_m
 from bayesrace.operation.report import write_report
@@ -25,7 +24,7 @@ from bayesrace.tracks import Track, load_track, write_track
 from bayesrace.vehicles import get_car
 from tests.command_line import Cli
 from tests.conftest import offset_line
-from tests.synthetic_race import Drive, circle, write_race
+from tests.synthetic_race import Drive, analyse, circle, write_race
 from tests.test_analysis import TWO_LAPS
 
 CAR = get_car("orca")

@@ -16,7 +16,7 @@ from bayesrace.learning.sources import dataset_from_log
 from bayesrace.learning.validation import identity
 from bayesrace.log import LogReader, LogWriter
 from bayesrace.messages import STATE, TRUTH, State, Truth
-from bayesrace.operation.analysis.race import analyse, read_race
+from bayesrace.operation.analysis.race import read_race
 from bayesrace.operation.analysis.results import RaceResult
 from bayesrace.operation.analysis.validation import validate_weights
 from bayesrace.operation.closed_loop import ClosedLoop, Driven
@@ -25,7 +25,7 @@ from bayesrace.vehicles import CarParameters
 from bayesrace.vehicles.models import dynamic
 from tests.conftest import Circuit
 from tests.driven import CAR, STEP_S, drive, write_log
-from tests.synthetic_race import LAP_S, Drive, circle, write_race
+from tests.synthetic_race import LAP_S, Drive, analyse, circle, write_race
 
 ERROR = np.array([0.0, 0.0, 0.0, 0.0, 0.1, 0.2, 0.0])
 """Of vy and omega, which :class:`Spy` does not look at: the car drives on as it did."""

@@ -41,7 +41,7 @@ from bayesrace.tracks import PathProjection, Track
 from bayesrace.tracks.spline import CentrelineSearch, PlaneSpline
 from bayesrace.vehicles import CarParameters
 
-__all__ = ["DrivenRun", "RaceAnalysis", "analyse", "read_race"]
+__all__ = ["DrivenRun", "RaceAnalysis", "read_race"]
 
 
 _SURELY: Final = 1.5
@@ -300,8 +300,3 @@ def read_race(run_dir: Path) -> RaceAnalysis:
     A race that was cut short can be analysed, too; what did not finish is marked so.
     """
     return RaceAnalysis(read_recording(run_dir))
-
-
-def analyse(run_dir: Path) -> RaceResult:
-    """The outcome of the race in ``run_dir``; InputError if that is no run directory."""
-    return read_race(run_dir).result

@@ -138,7 +138,7 @@ class SettingsSummary(_Frozen):
 
 
 class RaceResult(_Frozen):
-    """``result.json``: made from a run directory by :func:`.analyse`."""
+    """``result.json``: made from a run directory by :mod:`bayesrace.operation.analysis.race`."""
 
     settings: SettingsSummary
     laps: list[LapResult]
