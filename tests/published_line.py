@@ -9,7 +9,7 @@ the published line of ETHZ takes 7.046 s with theirs, 7.08 s here.
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -20,33 +20,22 @@ from bayesrace.tracks import load_track
 from bayesrace.vehicles import get_car
 from bayesrace.vehicles.parts import GRAVITY_MPS2
 
-__all__ = ["PUBLISHED", "objective"]
+__all__ = ["NODES", "objective"]
 
 _STEP_M: Final = 0.01
 _SHARE: Final = 0.95
 
 
-class Published(NamedTuple):
-    """Nodes as points of the track's file, and lap times after 110 evaluations, mean / best [s]."""
-
-    nodes: tuple[int, ...]
-    random: str
-    improvement: str
-    noisy: str
-
-
-PUBLISHED: Final = {
-    "ethz": Published(
-        (33, 67, 116, 166, 203, 239, 274, 309, 344, 362, 382, 407, 434, 448, 470, 514, 550, 586,
-         622, 657, 665),
-        "7.750 / 7.576", "7.033 / 6.967", "7.052 / 6.946",
+NODES: Final = {
+    "ethz": (
+        33, 67, 116, 166, 203, 239, 274, 309, 344, 362, 382, 407, 434, 448, 470, 514, 550, 586, 622,
+        657, 665,
     ),
-    "ethzmobil": Published(
-        (7, 21, 37, 52, 66, 81, 97, 111, 136, 160, 175, 191, 205, 220, 236, 250, 275, 299, 337,
-         376),
-        "5.744 / 5.582", "5.014 / 4.910", "4.871 / 4.668",
+    "ethzmobil": (
+        7, 21, 37, 52, 66, 81, 97, 111, 136, 160, 175, 191, 205, 220, 236, 250, 275, 299, 337, 376,
     ),
 }  # fmt: skip
+"""As points of the track's file."""
 
 
 def path_time(points: Floats) -> float:
@@ -77,7 +66,7 @@ def path_time(points: Floats) -> float:
 def objective(folder: Path, name: str) -> Callable[[Floats], float]:
     """Time by the places of the nodes, from 0 on the right to 1 on the left."""
     track = load_track(str(folder / f"{name}.csv"))
-    nodes = list(PUBLISHED[name].nodes)
+    nodes = list(NODES[name])
     width = float(track.width_left_m[0] + track.width_right_m[0])
     s = track.s_m[nodes]
     reach = track.length_m / (5 * len(nodes))

@@ -123,15 +123,6 @@ def test_datasets_are_checked(driven: Dataset) -> None:
     assert driven.features.shape == (len(driven), len(FEATURES))
 
 
-def test_messages_become_the_samples_that_were_driven(driven: Dataset) -> None:
-    states = logged(driven, 0)
-    data = dataset_of(states, [telemetry(0, 5, 0)])
-    assert np.array_equal(data.x, driven.x)
-    assert np.array_equal(data.u, driven.u)
-    assert np.array_equal(data.x_next, driven.x_next)
-    assert not data.dropped
-
-
 def test_gaps_fallback_and_other_runs_are_left_out(driven: Dataset) -> None:
     first, second = logged(driven, 0), logged(driven, 1)
     messages = first[:10] + first[11:] + second

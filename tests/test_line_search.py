@@ -20,7 +20,7 @@ from bayesrace.raceline.nodes import NodeLines, roughness
 from bayesrace.tracks import StartLine, load_track
 from bayesrace.vehicles import get_car
 from tests.command_line import Cli, refused
-from tests.published_line import PUBLISHED, objective
+from tests.published_line import NODES, objective
 from tests.reference import reference_file
 
 CAR = get_car("orca")
@@ -149,7 +149,7 @@ def test_the_driven_lap_is_the_objective(dynamic_artefact: Path) -> None:
 def test_fifty_evaluations_beat_the_published_mean_of_110(name: str, published_s: float) -> None:
     """reference/README.md, its better method; the objective is the published one."""
     folder = reference_file(f"tracks/{name}.csv").parent
-    function, count = objective(folder, name), len(PUBLISHED[name].nodes)
+    function, count = objective(folder, name), len(NODES[name])
     laps = [
         search(function, roughness(count), evaluations=50, seed=seed).y.min() for seed in range(3)
     ]

@@ -55,6 +55,7 @@ def test_what_are_no_weights_is_said_before_a_controller_is_looked_for(rig: Rig,
         path = rig.folder / "damaged.bin"
         path.write_bytes(content)
         refused(cli("publish", path), "damaged.bin", why)  # nobody is at the default endpoints
+    refused(cli("publish", rig.folder / "nowhere.bin"), "nowhere.bin: No such file")
 
 
 def test_another_model_is_refused(rig: Rig, cli: Cli) -> None:
@@ -64,11 +65,6 @@ def test_another_model_is_refused(rig: Rig, cli: Cli) -> None:
     write_weights(path, replace(weights, discretisation="bicycle/eulerx1-pose/0.02s/abc"))
     refused(cli("publish", path, "--car", "orca", *rig.endpoints), "refused", code=1)
     assert rig.version() == before
-
-
-def test_what_is_no_file_is_said_in_a_line(rig: Rig, cli: Cli) -> None:
-    done = cli("publish", rig.folder / "nowhere.bin", *rig.endpoints)
-    refused(done, "nowhere.bin: No such file")
 
 
 def test_a_car_that_is_not_there_is_said_in_a_line(rig: Rig, cli: Cli) -> None:

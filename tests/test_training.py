@@ -8,8 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from sklearn.gaussian_process import GaussianProcessRegressor
-from sklearn.gaussian_process.kernels import ConstantKernel, WhiteKernel
 
 from bayesrace import __version__
 from bayesrace.errors import InputError
@@ -38,7 +36,7 @@ from bayesrace.learning.validation import (
 )
 from bayesrace.vehicles.models import dynamic, e_kinematic
 from tests.driven import CAR, QUICK, STEP_S, drive
-from tests.scikit import correlation
+from tests.scikit import scikit_gp
 
 
 @pytest.fixture(scope="module")
@@ -59,19 +57,15 @@ def chosen(driven: Dataset) -> Training:
 def test_the_optimum_is_scikit_learns() -> None:
     """Same starts, same bounds: the best log marginal likelihoods agree within 1e-3."""
     data = drive(dynamic(CAR), 70, seed=3)
-    bounds, folds = np.exp(BOUNDS), np.zeros(len(data), dtype=np.int64)
+    folds = np.zeros(len(data), dtype=np.int64)
     for column in residual(data, PREDICTION).T[1:]:
         target = Target.of("vy", data.features, column, folds)
         pairs, found = PairDistances(target.z), []
         guesses = starts(1, seed=0)
         for guess in guesses:
-            theta = np.exp(guess)
-            base = correlation("rbf", theta[1:-1], length_scale_bounds=bounds[1:-1])
-            noise = WhiteKernel(theta[-1], tuple(bounds[-1]))
-            kernel = ConstantKernel(theta[0], tuple(bounds[0])) * base + noise
-            gp = GaussianProcessRegressor(kernel, alpha=0.0)
             with pytest.warns():  # that noise and some length scales end at their bounds
-                found.append(gp.fit(target.z, target.y).log_marginal_likelihood_value_)
+                gp = scikit_gp("rbf", guess, target.z, target.y, BOUNDS)
+            found.append(gp.log_marginal_likelihood_value_)
         ours = [maximise("rbf", pairs, target.y, guess, 300, 1e-9) for guess in guesses]
         assert max(fit.log_likelihood for fit in ours) == pytest.approx(max(found), abs=1e-3)
 
