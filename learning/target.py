@@ -171,11 +171,8 @@ class Target:
                 if fit is fits[-1] and not held:
                     raise
         chosen, _ = max(held, key=lambda one: one[1].log_density)
-        return chosen, [
-            KernelScore(self.name, fit.kind, *self._si(errors), fit is chosen)
-            for fit, errors in held
-        ]
-
-    def _si(self, errors: PredictionErrors) -> tuple[float, float]:
-        """RMSE and log density in SI units."""
-        return errors.rmse * self.y_scale, errors.log_density - math.log(self.y_scale)
+        scores = []
+        for fit, errors in held:
+            rmse, density = errors.rmse * self.y_scale, errors.log_density - math.log(self.y_scale)
+            scores.append(KernelScore(self.name, fit.kind, rmse, density, fit is chosen))
+        return chosen, scores

@@ -25,7 +25,7 @@ from bayesrace.gp.weights import GpWeights, decode_weights, write_weights, zero_
 from bayesrace.integrators import PERFECT, PREDICTION
 from bayesrace.learning.dataset import Dataset, concatenate
 from bayesrace.learning.sources import write_npz
-from bayesrace.learning.trainer import Outcome
+from bayesrace.learning.training import Outcome
 from bayesrace.learning.validation import recalled
 from bayesrace.messages import HEARTBEAT, STATE, Message, Reply, Role, State, Status, encode
 from bayesrace.operation.learn import collector, job, journal, publishing

@@ -17,8 +17,7 @@ from bayesrace.integrators import PREDICTION
 from bayesrace.learning.dataset import Dataset, concatenate
 from bayesrace.learning.settings import TrainingSettings
 from bayesrace.learning.subset import MOST_NEW, bounded
-from bayesrace.learning.trainer import NICE, Outcome, Trainer, perform
-from bayesrace.learning.training import train
+from bayesrace.learning.training import NICE, Outcome, Trainer, perform, train
 from bayesrace.learning.validation import recalled, residual
 from bayesrace.vehicles.models import dynamic
 from tests.driven import CAR, QUICK, drive
@@ -155,7 +154,7 @@ def test_training_is_a_niced_process_that_may_die_or_hang(
         died = outcome_of(trainer)
         assert (died.error, died.kept) == ("the training was killed by signal 9", None)
         os.kill(start(), signal.SIGSTOP)
-        monkeypatch.setattr("bayesrace.learning.trainer._LONGEST_S", 0.5)
+        monkeypatch.setattr("bayesrace.learning.training._LONGEST_S", 0.5)
         assert "no result after 0 s and was killed" in outcome_of(trainer).error
         monkeypatch.undo()
         start()

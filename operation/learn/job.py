@@ -17,7 +17,7 @@ from bayesrace.errors import InputError
 from bayesrace.gp.weights import read_weights
 from bayesrace.learning.settings import TrainingSettings
 from bayesrace.learning.sources import read_samples
-from bayesrace.learning.trainer import Trainer, perform
+from bayesrace.learning.training import Trainer, perform
 from bayesrace.learning.validation import discretisation_of, recalled
 from bayesrace.manifest import read_manifest
 from bayesrace.messages import TOPICS, TRUTH, Actuation, Event, State, Status, Telemetry
