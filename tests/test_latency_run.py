@@ -7,7 +7,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
@@ -28,7 +28,8 @@ from bayesrace.studies.latency.measure import _wait_for_run
 from bayesrace.tracks import Track
 from bayesrace.transport import Director, Endpoints, free_endpoint, open_session
 from tests.command_line import Cli, refused
-from tests.programs import COMMAND, ROOT, environment, finish, leftovers, peanut, start, until
+from tests.network.cars import Program
+from tests.programs import _arguments, finish, leftovers, peanut, start, until
 from tests.shared import session_folder
 
 pytestmark = pytest.mark.wall_clock
@@ -92,20 +93,15 @@ def test_every_leg_is_measured(loaded: Run) -> None:
     assert 0 < passed["p50"] < result["state_to_actuation_us"]["max"]
 
 
-def test_messages_sent_are_received_or_lost(loaded: Run) -> None:
+def test_messages_memory_laps_and_clocks_are_reported(loaded: Run) -> None:
     result = loaded.result
     assert all(one["complete"] for one in result["traffic"].values())
     in_flight = sum(one["in_flight"] for one in result["traffic"].values())
     assert result["sent"] == result["received"] + result["lost"] + in_flight
     assert result["sent"] > 100
-
-
-def test_memory_laps_and_clocks_are_reported(loaded: Run) -> None:
-    result = loaded.result
     assert set(result["rss"]) == {"plant", "controller"}
     assert result["rss_growth_bytes"] >= 0
-    assert result["clocks"]["shared"] is True
-    assert result["clocks"]["uncertainty_us"] == 0
+    assert (result["clocks"]["shared"], result["clocks"]["uncertainty_us"]) == (True, 0)
     assert result["states"] > 100
     assert result["off_track_samples"] is not None
     for words in ("state → actuation", "bare loop", "sent =", "one clock", "RUN"):
@@ -134,17 +130,11 @@ def test_the_log_of_a_run_gives_the_same_legs_again(loaded: Run, cli: Cli, tmp_p
     assert "recorded" in done.out
 
 
-def _with_parent(pid: int, word: str = "") -> list[int]:
+def _with_parent(pid: int, word: str = "--parent-pid") -> list[int]:
     """Processes that end with this one, those whose command line has this word."""
-    found = []
-    for entry in Path("/proc").glob("[0-9]*/cmdline"):
-        try:
-            words = entry.read_bytes().decode(errors="replace").split("\0")
-        except OSError:
-            continue
-        if "--parent-pid" in words and words[words.index("--parent-pid") + 1] == str(pid):
-            found += [int(entry.parent.name)] if not word or word in words else []
-    return found
+    lines = {int(entry.name): _arguments(entry.name) for entry in Path("/proc").glob("[0-9]*")}
+    parent = f"--parent-pid {pid} "
+    return [one for one, words in lines.items() if parent in " ".join(words) and word in words]
 
 
 def _observing(out: Path) -> bool:
@@ -222,37 +212,17 @@ def test_a_measurement_is_never_overwritten(cli: Cli, tmp_path: Path, name: str)
 
 
 @contextmanager
-def _process(line: list[str]) -> Iterator[None]:
-    process = subprocess.Popen(
-        line, stdin=subprocess.DEVNULL, cwd=ROOT, env=environment(), start_new_session=True
-    )  # fmt: skip
-    try:
-        yield
-    finally:
-        os.killpg(process.pid, signal.SIGTERM)
-        try:
-            process.wait(10)
-        except subprocess.TimeoutExpired:
-            os.killpg(process.pid, signal.SIGKILL)
-            process.wait()
-
-
-@contextmanager
-def _system(files: Prepared, prefix: list[str]) -> Iterator[tuple[list[str], Director]]:
-    """A system, the plant started by way of ``prefix``: its endpoints and its director."""
-    plant, controller = free_endpoint(), free_endpoint()
-    with ExitStack() as stack:
-        stack.enter_context(
-            _process([*prefix, *COMMAND, "plant", "--endpoint", plant, "--name", "other"])
-        )
-        stack.enter_context(
-            _process([
-                *COMMAND, "controller", *files.arguments,
-                "--weights", str(files.weights), "--endpoint", plant, "--listen", controller,
-                "--name", "other",
-            ])
-        )  # fmt: skip
-        session = stack.enter_context(open_session(Endpoints(connect=(plant, controller))))
+def _system(
+    files: Prepared, folder: Path, host: Any = None
+) -> Iterator[tuple[list[str], Director]]:
+    """A system, its plant on that host: its endpoints and its director."""
+    plant, controller, name = free_endpoint(), free_endpoint(), ("--name", "other")
+    drive = (*files.arguments, "--weights", str(files.weights), "--endpoint", plant)
+    with (
+        Program(folder / "plant.txt", "plant", "--endpoint", plant, *name, host=host),
+        Program(folder / "controller.txt", "controller", *drive, "--listen", controller, *name),
+        open_session(Endpoints(connect=(plant, controller))) as session,
+    ):
         director = Director(session, "other")
         director.wait_for(("plant", "controller"), 60.0)
         yield [plant, controller], director
@@ -275,7 +245,7 @@ def _attached(endpoints: list[str], director: Director, track: Track, out: Path)
 
 @pytest.mark.check
 def test_a_running_system_is_measured_and_left_running(files: Prepared, tmp_path: Path) -> None:
-    with _system(files, []) as (endpoints, director):
+    with _system(files, tmp_path) as (endpoints, director):
         result = _attached(endpoints, director, files.first.track, tmp_path / "run")
         assert director.status("plant").phase == "running"
         until(lambda: director.status("controller").phase == "driving", "driven, as before")
@@ -329,7 +299,8 @@ def test_clock_of_another_host_is_found_and_corrected(files: Prepared, tmp_path:
     if why_not := _time_namespaces():
         pytest.skip(f"time namespaces are not allowed here: {why_not}")
     prefix = ["unshare", "--time", "--monotonic=1000", "--fork", "--kill-child"]
-    with _system(files, prefix) as (endpoints, director):
+    host = SimpleNamespace(command=lambda *words: [*prefix, *words])
+    with _system(files, tmp_path, host) as (endpoints, director):
         result = _attached(endpoints, director, files.first.track, tmp_path / "run")
     clocks = result["clocks"]
     assert clocks["shared"] is False

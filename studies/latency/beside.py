@@ -144,7 +144,8 @@ def _loop(path: str, period_ns: int, begin_ns: int, count: int) -> None:
 def _answer(endpoint: str, period_ns: int) -> None:
     """Sends back what comes, until it is ended."""
     with open_session(Endpoints(listen=(endpoint,))) as session:
-        there, back = _receiver(session, "there"), _sender(session, "back")
+        there = session.declare_subscriber("there", zenoh.handlers.FifoChannel(100))
+        back = session.declare_publisher("back", express=True)
         while True:
             back.put(there.recv().payload)
 
@@ -154,7 +155,8 @@ def _send(endpoint: str, path: str, period_ns: int, begin_ns: int) -> None:
     taken_ns = np.lib.format.open_memmap(path, mode="r+")
     begin_ns += period_ns // 2
     with open_session(Endpoints(connect=(endpoint,)), peers_follow=True) as session:
-        back, there = _receiver(session, "back"), _sender(session, "there")
+        back = session.declare_subscriber("back", zenoh.handlers.FifoChannel(100))
+        there = session.declare_publisher("there", express=True)
         while not there.matching_status.matching:
             time.sleep(_LOOK_S)
         first = max(0, -(-(time.monotonic_ns() - begin_ns) // period_ns))
@@ -164,14 +166,6 @@ def _send(endpoint: str, path: str, period_ns: int, begin_ns: int) -> None:
             there.put(_BYTES)
             back.recv()
             taken_ns[k] = time.monotonic_ns() - sent_ns
-
-
-def _receiver(session: Any, key: str) -> Any:
-    return session.declare_subscriber(key, zenoh.handlers.FifoChannel(100))
-
-
-def _sender(session: Any, key: str) -> Any:
-    return session.declare_publisher(key, express=True)
 
 
 def _run(work: str, realtime: Any, **task: Any) -> None:

@@ -13,7 +13,7 @@ from bayesrace.errors import InputError
 from bayesrace.files import claimed, write_whole
 from bayesrace.messages import Event
 from bayesrace.operation.drive import RunPlan, run_request
-from bayesrace.operation.preparation import Prepared, prepare
+from bayesrace.operation.preparation import prepare
 from bayesrace.operation.settings import PreparationSettings
 from bayesrace.operation.system import Child, endings, started_system
 from bayesrace.operation.terminal.terminal import Stages
@@ -123,16 +123,21 @@ def _record(
     run: Run, settings: LatencySettings, track: Track | None, out: Path, stages: Stages
 ) -> None:
     """Records the run, and the machine beside it."""
-    start = settings.attach is None
-    files = _files(settings, stages) if start else None
+    files = None
+    if settings.attach is None:
+        files = prepare(
+            PreparationSettings(car=settings.car), (settings.track,), stages,
+            raceline=settings.raceline, weights=settings.weights, artefact=settings.artefact,
+        )  # fmt: skip
     with ExitStack() as stack:
         stack.enter_context(claimed(out))
-        with stages.stage("start plant and controller" if start else "attach"):
+        with stages.stage("attach" if settings.attach else "start plant and controller"):
             stack.enter_context(_explained(run))
             if files is not None:
-                plant, both = _options(settings, out)
-                system = stack.enter_context(started_system(run.car, out, plant, both))
-                stack.enter_context(system.controller([*files.arguments, *plant]))
+                write_car(out / "car.toml", settings.car)
+                car, both = ["--car", str(out / "car.toml")], _options(settings)
+                system = stack.enter_context(started_system(run.car, out, car, both))
+                stack.enter_context(system.controller([*files.arguments, *car]))
                 session, director, run.children = system.session, system.director, system.children
             elif settings.attach is not None:
                 settings.attach.check_car(run.car)
@@ -144,7 +149,7 @@ def _record(
             rate_hz = director.status("controller").rate_hz
             about = {"latency": {"settings": settings.model_dump_json()}}
             recorder = stack.enter_context(Recorder(session, run.car, out / _LOG, about))
-            if track is not None and start:
+            if track is not None and settings.attach is None:
                 limit_s = settings.warm_up_s + settings.duration_s + _AFTERWARDS_S
                 plan = RunPlan(1, "bayesrace", 0, limit_s, lockstep=False)
                 director.start(run_request(track, plan))
@@ -178,22 +183,12 @@ def _wait_for_run(director: Director, car: str) -> None:
         time.sleep(_LOOK_S)
 
 
-def _files(settings: LatencySettings, stages: Stages) -> Prepared:
-    """What plant and controller are started with."""
-    return prepare(
-        PreparationSettings(car=settings.car), (settings.track,), stages,
-        raceline=settings.raceline, weights=settings.weights, artefact=settings.artefact,
-    )  # fmt: skip
-
-
-def _options(settings: LatencySettings, out: Path) -> tuple[list[str], list[str]]:
-    """Options that name the car, and further ones, all of them of plant and controller."""
-    realtime, car_file = settings.realtime, out / "car.toml"
-    write_car(car_file, settings.car)
+def _options(settings: LatencySettings) -> list[str]:
+    """Those of plant and controller."""
+    realtime = settings.realtime
     both = ["--name", settings.car_name, "--rate", repr(settings.rate_hz)]
     both += ["--lock-memory"] if realtime.lock_memory else []
-    both += ["--fifo", str(realtime.fifo)] if realtime.fifo else []
-    return ["--car", str(car_file)], both
+    return both + (["--fifo", str(realtime.fifo)] if realtime.fifo else [])
 
 
 def _stop(director: Director) -> None:
