@@ -12,11 +12,10 @@ from hypothesis import strategies as st
 from rich.console import Console
 
 from bayesrace.errors import InputError
-from bayesrace.studies.latency.analysis import Analysis, Beside, analyse
+from bayesrace.studies.latency.analysis import Analysis, Beside, Memory, Series, analyse
 from bayesrace.studies.latency.beside import bare_loop, bare_result
 from bayesrace.studies.latency.legs import ANSWER, BESIDE, LEGS, ClockMap
 from bayesrace.studies.latency.report import print_report, write_files
-from bayesrace.studies.latency.results import Memory, Series
 from bayesrace.studies.latency.settings import LatencySettings
 from bayesrace.transport import Endpoints
 from tests.synthetic_latency import PERIOD_NS, Loop, report_of

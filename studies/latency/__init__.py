@@ -5,5 +5,5 @@ same code whether the run was started here, was driven elsewhere, or was recorde
 
 In the order of use: ``settings``; ``measure`` records the run, with the processes of ``beside``.
 ``legs`` reads the log, joins the messages of a cycle, relates the clocks of plant and controller,
-and counts messages. ``analysis`` makes the ``results``; ``report`` shows them.
+and counts messages. ``analysis`` makes the result, which ``report`` shows.
 """

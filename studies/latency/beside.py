@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from bayesrace.operation.system import child
 from bayesrace.processes import die_with_parent
 from bayesrace.realtime import RealtimeSettings, prepare_thread, sleep_until_ns
-from bayesrace.studies.latency.results import BareLoop, Series
+from bayesrace.studies.latency.analysis import BareLoop, Series
 from bayesrace.transport import Endpoints, open_session, private_endpoints
 
 __all__ = ["bare_loop", "bare_result", "read_bare_loop", "read_round_trips", "running_beside"]

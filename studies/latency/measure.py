@@ -18,10 +18,9 @@ from bayesrace.operation.settings import PreparationSettings
 from bayesrace.operation.system import Child, endings, started_system
 from bayesrace.operation.terminal.terminal import Stages
 from bayesrace.recorder import Recorder
-from bayesrace.studies.latency.analysis import Beside, analyse
+from bayesrace.studies.latency.analysis import Beside, LatencyResult, Memory, analyse
 from bayesrace.studies.latency.beside import read_bare_loop, read_round_trips, running_beside
 from bayesrace.studies.latency.report import RESULT, write_files
-from bayesrace.studies.latency.results import LatencyResult, Memory
 from bayesrace.studies.latency.settings import LatencySettings
 from bayesrace.tracks import Track, load_track
 from bayesrace.transport import Director, Item, Kind, open_session

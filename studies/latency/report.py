@@ -16,9 +16,8 @@ from rich.text import Text
 from bayesrace.files import replacing, write_whole
 from bayesrace.operation.report.style import INK, MUTED, figure_style, write_png
 from bayesrace.operation.terminal.terminal import plain_table
-from bayesrace.studies.latency.analysis import Analysis
+from bayesrace.studies.latency.analysis import Analysis, Distribution, LatencyResult
 from bayesrace.studies.latency.legs import ANSWER, BESIDE, LEGS
-from bayesrace.studies.latency.results import Distribution, LatencyResult
 
 __all__ = ["RESULT", "print_report", "write_files"]
 
