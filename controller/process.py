@@ -102,17 +102,15 @@ class ControllerProcess:
         inbox = self.inbox = Inbox(session, self.name)
         self._decoder = inbox.subscribe(STATE, newest=NEWEST)
         self._service = Service(
-            session, inbox, name=self.name, rate_hz=settings.rate_hz, driver=self._driver,
-            controller=controller, counters=self._counters, words=self._words,
-            takes_weights=controller.port is not None,
-        )  # fmt: skip
+            session, inbox, self.name, settings.rate_hz, self._driver, self._counters
+        )
         self._weights: WeightUpdateManager | None = None
         self._adoption: Adoption | None = None
         if controller.port is not None:
             self._weights = WeightUpdateManager(
                 session, self.name, controller.port, settings.gate, self._service.announce
             )
-            self._adoption = self._weights.adoption
+            self._service.weights, self._adoption = self._weights, self._weights.adoption
         inbox.watch("plant")
         inbox.announce("controller")
         if self._weights is not None:
@@ -388,9 +386,6 @@ class ControllerProcess:
         """``tick`` of the next release's cycle, unless it is passed over."""
         return self._timing.tick + 1
 
-    def _words(self) -> str:
-        return "" if self._weights is None else self._weights.text
-
     def _counters(self) -> dict[str, Scalar]:
         """What the loop has counted, by name."""
         timing, driver = self._timing, self._driver
@@ -407,7 +402,6 @@ class ControllerProcess:
             "refused": self._decoder.refused,
             "overflowed": self.inbox.overflowed,
             "requests_rejected": self.inbox.requests_rejected,
-            **({} if self._weights is None else self._weights.status()),
             "actuations_sent": self._actuations.next_seq,
         }
 

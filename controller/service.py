@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, Final
 
 from bayesrace.controller.driver import Driver, Level
-from bayesrace.controller.interface import Controller
+from bayesrace.controller.weights.manager import WeightUpdateManager
 from bayesrace.messages import (
     COMMAND,
     EVENT,
@@ -31,29 +31,24 @@ class Service:
         self,
         session: Any,
         inbox: Inbox,
-        *,
         name: str,
         rate_hz: float,
         driver: Driver,
-        controller: Controller,
         counters: Callable[[], Mapping[str, Scalar]],
-        words: Callable[[], str],
-        takes_weights: bool,
     ) -> None:
-        """``counters``: counts of the loop, for each status; ``words``: further text for it.
-        ``takes_weights``: the weights update manager serves these requests."""
+        """``counters``: counts of the loop, for each status."""
         self._rate_hz = rate_hz
         self._driver = driver
-        self._controller = controller
+        self._controller = driver.controller
         self._counters = counters
-        self._own_words = words
+        self.weights: WeightUpdateManager | None = None
+        """Serves requests about weights, where the controller takes any."""
         self._events = Publisher(session, EVENT, name, "controller", waits=False)
         self._heartbeat = Heartbeat(session, name, "controller")
         self._text = "waiting for the plant"
         self._publishing = threading.Lock()
         self._weights_refused = 0
         self._fault_reported = False
-        self._takes_weights = takes_weights
         self.stopping = False
         """The process has received a signal to end."""
         self.plant_there = True
@@ -62,7 +57,7 @@ class Service:
         """Monotonic clock when the newest state arrived."""
         inbox.serve(STATUS, "controller")
         inbox.serve(COMMAND)
-        if not takes_weights:
+        if self._controller.port is None:
             inbox.serve(WEIGHTS)
             inbox.serve(ROLLBACK)
 
@@ -123,8 +118,8 @@ class Service:
         failed = driver.count("failed")
         if failed:
             words.append(f"{failed} step(s) failed, the last {driver.last_error}")
-        if more := self._own_words():
-            words.append(more)
+        if self.weights is not None and self.weights.text:
+            words.append(self.weights.text)
         return "; ".join(words)
 
     def _answer(self, request: Request) -> None:
@@ -169,7 +164,7 @@ class Service:
             self._events.put(event, lockstep=newest is None or newest.lockstep)
 
     def _count(self) -> dict[str, Scalar]:
-        driver, levels = self._driver, self._driver.levels
+        driver, levels, weights = self._driver, self._driver.levels, self.weights
         return {
             **self._counters(),
             "solution": levels[Level.SOLUTION],
@@ -180,5 +175,5 @@ class Service:
             "second_starts": driver.count("second_starts"),
             "cost_jumps": driver.count("cost_jumps"),
             **{f"sensor_{name}": count for name, count in driver.faults.items() if count},
-            **({} if self._takes_weights else {"weights_refused": self._weights_refused}),
+            **(weights.status() if weights else {"weights_refused": self._weights_refused}),
         }

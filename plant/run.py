@@ -9,8 +9,7 @@ from typing import Final, NamedTuple
 
 from bayesrace.messages import ACTUATION, Actuation, BrakingPlan, Decoder, RunRequest, State, Truth
 from bayesrace.plant.car import CarRun, End, Sensors, drive_lockstep, fault_end, truth_behind
-from bayesrace.plant.guard import Command, planned_at
-from bayesrace.plant.vehicle import FmuFault, Vehicle
+from bayesrace.plant.vehicle import Command, FmuFault, Vehicle, planned_at
 from bayesrace.realtime import SUSPENDED_S, sleep_until_ns
 from bayesrace.transport import LOCKSTEP_SPIN_S, Inbox, Item, Kind, Numbering, Publisher
 

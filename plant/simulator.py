@@ -7,8 +7,7 @@ import numpy as np
 from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
 from bayesrace.integrators import PLANT_SCHEME, PLANT_SUBSTEP_HZ, Discretisation
-from bayesrace.plant.guard import Command
-from bayesrace.plant.vehicle import Compile, Vehicle
+from bayesrace.plant.vehicle import Command, Compile, Vehicle
 from bayesrace.vehicles.models import Model
 
 __all__ = ["PLANT", "Simulator", "plant_discretisation"]

@@ -18,9 +18,8 @@ import slipx
 
 from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
-from bayesrace.plant.guard import Command
 from bayesrace.plant.simulator import plant_discretisation
-from bayesrace.plant.vehicle import FmuFault, Vehicle
+from bayesrace.plant.vehicle import Command, FmuFault, Vehicle
 from bayesrace.vehicles.parameters import CarParameters
 
 __all__ = ["SlipxSimulator"]

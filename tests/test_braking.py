@@ -21,7 +21,7 @@ from bayesrace.messages import TRUTH, BrakingPlan, State
 from bayesrace.operation.closed_loop import ClosedLoop
 from bayesrace.operation.drive import RunPlan, run_request
 from bayesrace.operation.system import started_system
-from bayesrace.plant.guard import planned_at
+from bayesrace.plant.vehicle import planned_at
 from bayesrace.recorder import Recorder
 from tests.racing import Racing, prepared, racing
 from tests.reference import reference_file

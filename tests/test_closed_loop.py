@@ -12,16 +12,14 @@ from bayesrace.controller.pure_pursuit import PurePursuit, PurePursuitSettings
 from bayesrace.controller.python_controller import PythonController
 from bayesrace.controller.settings import MpcSettings
 from bayesrace.gp.weights import read_weights
-from bayesrace.learning.sources import dataset_from_log
 from bayesrace.log import LogReader, LogWriter
 from bayesrace.messages import ACTUATION, EVENT, STATE, TELEMETRY, TRUTH, Event, State
 from bayesrace.operation.closed_loop import ClosedLoop
 from bayesrace.operation.collect import collect
 from bayesrace.operation.drive import RunPlan, execute
-from bayesrace.plant.guard import Command
 from bayesrace.plant.settings import SensorNoise
 from bayesrace.plant.simulator import Simulator
-from bayesrace.plant.vehicle import FmuFault
+from bayesrace.plant.vehicle import Command, FmuFault
 from bayesrace.raceline import read_raceline
 from bayesrace.recorder import Recorder
 from bayesrace.tracks import load_track
@@ -179,17 +177,3 @@ def test_without_track_constraints_another_problem_is_solved(
         for one in (True, False)
     ]
     assert not np.array_equal(driven[0].x, driven[1].x)
-
-
-def test_samples_are_those_of_its_log(
-    circuit: Circuit, car: CarParameters, kinematic_artefact: Path, tmp_path: Path
-) -> None:
-    line = circuit.line
-    law = PurePursuit(car, line.x_m, line.y_m, line.vx_mps)
-    pursuit = PythonController(kinematic_artefact, law)
-    log = LogWriter(tmp_path / "log.mcap")
-    driven = ClosedLoop(car, circuit.track, line, pursuit, log=log).drive(1)
-    log.close()
-    logged = dataset_from_log(tmp_path / "log.mcap", car, driven.step_s)
-    assert len(logged) > 100
-    assert driven.samples().digest() == logged.digest()

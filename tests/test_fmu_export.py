@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 from bayesrace.codegen.fmu import Variable, car_fmu, pack
 from bayesrace.errors import InputError
-from bayesrace.plant.guard import PlantGuard
+from bayesrace.plant.vehicle import PlantGuard
 from bayesrace.vehicles import CarParameters, get_car
 from bayesrace.vehicles.models import STATES
 from tests.car_fmu import Kind, Version, built_in, commands, driven, packed_car, slave, unpacked_car

@@ -6,7 +6,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -213,13 +213,13 @@ def test_a_measurement_is_never_overwritten(cli: Cli, tmp_path: Path, name: str)
 
 @contextmanager
 def _system(
-    files: Prepared, folder: Path, host: Any = None
+    files: Prepared, folder: Path, prefix: Sequence[str] = ()
 ) -> Iterator[tuple[list[str], Director]]:
-    """A system, its plant on that host: its endpoints and its director."""
+    """A system, its plant started by ``prefix``: its endpoints and its director."""
     plant, controller, name = free_endpoint(), free_endpoint(), ("--name", "other")
     drive = (*files.arguments, "--weights", str(files.weights), "--endpoint", plant)
     with (
-        Program(folder / "plant.txt", "plant", "--endpoint", plant, *name, host=host),
+        Program(folder / "plant.txt", "plant", "--endpoint", plant, *name, prefix=prefix),
         Program(folder / "controller.txt", "controller", *drive, "--listen", controller, *name),
         open_session(Endpoints(connect=(plant, controller))) as session,
     ):
@@ -299,8 +299,7 @@ def test_clock_of_another_host_is_found_and_corrected(files: Prepared, tmp_path:
     if why_not := _time_namespaces():
         pytest.skip(f"time namespaces are not allowed here: {why_not}")
     prefix = ["unshare", "--time", "--monotonic=1000", "--fork", "--kill-child"]
-    host = SimpleNamespace(command=lambda *words: [*prefix, *words])
-    with _system(files, tmp_path, host) as (endpoints, director):
+    with _system(files, tmp_path, prefix) as (endpoints, director):
         result = _attached(endpoints, director, files.first.track, tmp_path / "run")
     clocks = result["clocks"]
     assert clocks["shared"] is False

@@ -25,7 +25,6 @@ from bayesrace.recorder import Recorder
 from bayesrace.transport import Endpoints, Request, declare_service, open_session
 from tests import sample_messages as messages
 from tests.car_fmu import packed_car
-from tests.programs import until
 from tests.pursuit_rig import CONTROLLER, PATIENCE_S, PLANT, Rig, running_rig, start
 
 # Drives well, with a plan, for a second; then raises, then gives no number.
@@ -130,33 +129,6 @@ def test_free_running_drives_in_real_time(simulated_by: dict[str, str], tmp_path
 def test_a_plant_for_lockstep_refuses_to_run_in_real_time(rig: Rig) -> None:
     with pytest.raises(InputError, match=r"started for lockstep \(--low-latency\)"):
         rig.start(lockstep=False)
-
-
-@pytest.mark.wall_clock
-def test_a_free_running_car_brakes_when_its_controller_dies(
-    simulated_by: dict[str, str], tmp_path: Path
-) -> None:
-    """Without priorities or with: in real time the transport's defaults are used."""
-    log = tmp_path / "log"
-    with running_rig(simulated_by, low_latency=False) as rig, Recorder(rig.session, "orca", log):
-        rig.director.wait_for(("plant",), PATIENCE_S)
-        run = rig.start(lockstep=False, laps=0, max_time_s=1e5, actuation_timeout_s=0.1)
-        rig.wait_until_driving(run)
-        rig.controller.kill()
-        rig.spectator.wait_for(run, lambda state: abs(state.x[3]) < 0.05, "standstill")
-        until(lambda: unanswered(rig) > 20, "late and braked periods", PATIENCE_S)
-        assert rig.director.stop("it stands").accepted
-        end = rig.director.wait_for_end(run, PATIENCE_S, absence_s=PATIENCE_S)
-    assert end.data["reason"] == "stopped"
-    states = LogReader(log).select(STATE)
-    assert max(state.x[3] for state in states) > 0.5
-    assert abs(states[-1].x[3]) < 0.05
-
-
-def unanswered(rig: Rig) -> int:
-    """Periods that were late, and braked."""
-    counters = rig.director.status("plant").counters
-    return min(int(counters["late"]), int(counters["braked"]))
 
 
 def test_a_failing_step_goes_down_the_levels_and_the_car_stops(

@@ -11,9 +11,8 @@ import numpy as np
 import pytest
 
 from bayesrace.messages import Actuation, BrakingPlan, Decoder, RunRequest, State, Truth
-from bayesrace.plant.guard import GuardCounters
 from bayesrace.plant.run import Run, RunCounters
-from bayesrace.plant.vehicle import Vehicle, open_vehicle
+from bayesrace.plant.vehicle import GuardCounters, Vehicle, open_vehicle
 from bayesrace.transport import Inbox, Item, Kind, Numbering, Publisher
 from bayesrace.vehicles import get_car
 from tests.car_fmu import packed_car

@@ -12,7 +12,6 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 from typing import Any, Literal
 
@@ -20,10 +19,8 @@ import pytest
 from msgspec.structs import replace
 
 from bayesrace.messages import (
-    ACTUATION,
     COMMAND,
     STATE,
-    Actuation,
     Command,
     State,
     car_key,
@@ -79,10 +76,22 @@ class Rig:
         """Waits until the car has got a good deal further."""
         drive_on(self.observer)
 
-    def journey(self) -> Journey:
-        """What has been recorded, after the end."""
+    def driving(self, *options: str) -> tuple[Program, Program]:
+        """A controller and a plant that have begun to drive the car, in the order of their end."""
+        plant, controller = self.start_plant(*options), self.start_controller()
+        self.observer.start(1)
+        self.drive_on()
+        return controller, plant
+
+    def finished(self, *programs: Program) -> Journey:
+        """What has been recorded, after the end of run and programs, on the track all the way."""
+        self.observer.stop()
+        for program in programs:
+            program.end()
         self._following.close()
-        return Journey(self.log, self.course.track)
+        journey = Journey(self.log, self.course.track)
+        assert journey.off_track_m() < 0.0
+        return journey
 
 
 @contextmanager
@@ -157,12 +166,7 @@ def _take_over(rig: Rig) -> None:
     plant_counters, counters = (
         rig.observer.status(source)["counters"] for source in ("plant", "controller")
     )
-    rig.observer.stop()
-    successor.end()
-    plant.end()
-
-    journey = rig.journey()
-    assert journey.off_track_m() < 0.0
+    journey = rig.finished(successor, plant)
     acted = next(state for state in journey.states if _answers_since(state, last.seq + 1))
     waited_s = (acted.source_time_ns - killed_ns) * 1e-9
     _log.info("taken over after %.2f s, at %.2f m/s", waited_s, acted.x[3])
@@ -185,9 +189,7 @@ def _answers_since(state: State, seq: int) -> bool:
 @pytest.mark.parametrize("fmu", [False, True])
 def test_a_plant_started_again_is_found(rig: Rig, fmu: bool) -> None:
     options = ("--fmu", str(packed_car())) if fmu else ()
-    plant, controller = rig.start_plant(*options), rig.start_controller()
-    rig.observer.start(1)
-    rig.drive_on()
+    controller, plant = rig.driving(*options)
     before = rig.state()
     plant.kill()
     until(
@@ -206,21 +208,14 @@ def test_a_plant_started_again_is_found(rig: Rig, fmu: bool) -> None:
     status = rig.observer.status("controller")
     assert status["epoch"] == rig.state().epoch
     assert status["counters"]["states_stale"] == 0
-    rig.observer.stop()
-    controller.end()
-    plant.end()
-
-    journey = rig.journey()
+    journey = rig.finished(controller, plant)
     assert {state.run for state in journey.states} == {1}
-    for epoch in (before.epoch, status["epoch"]):
-        assert journey.off_track_m([s for s in journey.states if s.epoch == epoch]) < 0.0
+    assert {state.epoch for state in journey.states} == {before.epoch, status["epoch"]}
 
 
 def test_foreign_states_are_counted_and_the_car_drives_on(rig: Rig) -> None:
     """Numbers ahead, another plant's: each once silenced the controller."""
-    plant, controller = rig.start_plant(), rig.start_controller()
-    rig.observer.start(1)
-    rig.drive_on()
+    controller, plant = rig.driving()
     with open_session(Endpoints(connect=(rig.controller_at,)), "plant") as session:
         publisher = Publisher(session, STATE, "orca")
 
@@ -240,18 +235,13 @@ def test_foreign_states_are_counted_and_the_car_drives_on(rig: Rig) -> None:
         status = rig.observer.status("controller")
     assert status["epoch"] == rig.state().epoch
     assert status["counters"]["states_lost"] < 20
-    rig.observer.stop()
-    controller.end()
-    plant.end()
-    assert rig.journey().off_track_m() < 0.0
+    rig.finished(controller, plant)
 
 
 @pytest.mark.check
 def test_connections_that_stay_silent_do_not_hold_up_the_states(rig: Rig) -> None:
     """A port scan: it cost some 45 cycles without a state."""
-    plant, controller = rig.start_plant(), rig.start_controller()
-    rig.observer.start(1)
-    rig.drive_on()
+    controller, plant = rig.driving()
     before = rig.observer.status("controller")["counters"]
     host, port = rig.controller_at.removeprefix("tcp/").split(":")
     with ExitStack() as stack:
@@ -260,16 +250,12 @@ def test_connections_that_stay_silent_do_not_hold_up_the_states(rig: Rig) -> Non
         rig.drive_on()
         after = rig.observer.status("controller")["counters"]
     assert after["brake"] + after["stop"] - before["brake"] - before["stop"] < 20
-    rig.observer.stop()
-    controller.end()
-    plant.end()
+    rig.finished(controller, plant)
 
 
 @pytest.mark.check
 def test_requests_without_end_do_not_hold_up_the_loop(rig: Rig) -> None:
-    plant, controller = rig.start_plant(), rig.start_controller()
-    rig.observer.start(1)
-    rig.drive_on()
+    controller, plant = rig.driving()
     with open_session(Endpoints(connect=(rig.controller_at,))) as session:
         request = encode(Command(seq=0, source_time_ns=0, command="go", text="again"))
         key, end_s = car_key(COMMAND.key, "orca"), time.monotonic() + 3.0
@@ -282,111 +268,34 @@ def test_requests_without_end_do_not_hold_up_the_loop(rig: Rig) -> None:
     counters = rig.observer.status("controller")["counters"]
     assert 10 <= accepted <= 100
     assert counters["requests_rejected"] > 200
-    rig.observer.stop()
-    controller.end()
-    plant.end()
-    assert rig.journey().off_track_m() < 0.0
-
-
-@pytest.mark.check
-def test_an_actuation_for_another_plant_does_not_act(rig: Rig) -> None:
-    """A forgery with the right run, state and time acts; with another epoch it is stale."""
-    plant, controller = rig.start_plant(), rig.start_controller()
-    rig.observer.start(1)
-    rig.drive_on()
-    marks_ns, stale = [], []
-    with open_session(Endpoints(connect=(rig.plant_at,)), "controller") as session:
-        publisher = Publisher(session, ACTUATION, "orca")
-        until(lambda: _stale_after(rig, publisher, 1, 1) > 0, "a plant that hears the forger")
-        for epoch_shift in (1, 0):
-            marks_ns.append(time.monotonic_ns())
-            stale.append(_stale_after(rig, publisher, epoch_shift, 100))
-    marks_ns.append(time.monotonic_ns())
-    rig.observer.stop()
-    controller.end()
-    plant.end()
-
-    journey = rig.journey()
-    surplus = []  # of answers that acted, over the controller's own: one to each state
-    for begin_ns, end_ns in pairwise(marks_ns):
-        states = journey.between(begin_ns, end_ns)
-        acted = [
-            acting_s
-            for state in states
-            for acting_s in state.actuation_delays[2::3]
-            if acting_s >= 0
-        ]
-        surplus.append(len(acted) - len(states))
-    assert stale[0] >= 100
-    assert surplus[1] > surplus[0] + 20
-
-
-def _stale_after(rig: Rig, publisher: Publisher[Actuation], epoch_shift: int, count: int) -> int:
-    """Sends forgeries that fit the newest state; by how much the plant's counter has risen."""
-    before = rig.observer.status("plant")["counters"]["stale"]
-    for _ in range(count):
-        state = rig.state()
-        now_ns = time.monotonic_ns()
-        # as new as can be without coming from the future
-        decided_at_s = state.time_s + (now_ns - state.source_time_ns) * 1e-9 - 1e-3
-        forgery = Actuation(
-            seq=publisher.next_seq,
-            source_time_ns=now_ns,
-            epoch=state.epoch + epoch_shift,
-            run=state.run,
-            state_seq=state.seq,
-            decided_at_s=decided_at_s,
-            u=(0.3, 0.0),
-            weights_version="forged",
-            status=0,
-        )
-        publisher.put(forgery, lockstep=False)
-        time.sleep(0.01)
-    time.sleep(0.1)
-    after = rig.observer.status("plant")["counters"]["stale"]
-    return int(after) - int(before)
-
-
-def _assert_went_on(
-    rig: Rig, broken_ns: int, joined_ns: int, programs: tuple[Program, ...]
-) -> None:
-    """After the break the car has slowed down, then driven on, all of it on the track."""
-    rig.drive_on()
-    until(lambda: rig.observer.status("controller")["phase"] == "driving", "it to drive again")
-    counters = rig.observer.status("plant")["counters"]
-    rig.observer.stop()
-    for program in programs:
-        program.end()
-    assert counters["planned"] + counters["braked"] > 0
-    assert counters["refused"] == counters["rejected"] == 0
-    journey = rig.journey()
-    meanwhile = journey.between(broken_ns, joined_ns)
-    assert meanwhile[-1].x[3] < 0.5 * meanwhile[0].x[3]
-    assert journey.off_track_m() < 0.0
-    after = journey.states[-1].source_time_ns
-    assert "driving" in journey.phases(joined_ns, after)
+    rig.finished(controller, plant)
 
 
 @pytest.mark.check
 def test_a_broken_connection_is_made_again(tmp_path: Path, course: Course) -> None:
     with rigged(tmp_path, course, "proxy") as rig:
-        plant, controller = rig.start_plant(), rig.start_controller()
-        rig.observer.start(1)
-        rig.drive_on()
+        controller, plant = rig.driving()
         rig.proxy.cut()
         broken_ns = time.monotonic_ns()
         time.sleep(1.0)
         joined_ns = time.monotonic_ns()
         rig.proxy.join()
-        _assert_went_on(rig, broken_ns, joined_ns, (controller, plant))
+        rig.drive_on()
+        until(lambda: rig.observer.status("controller")["phase"] == "driving", "it to drive again")
+        counters = rig.observer.status("plant")["counters"]
+        journey = rig.finished(controller, plant)
+    assert counters["planned"] + counters["braked"] > 0
+    assert counters["refused"] == counters["rejected"] == 0
+    meanwhile = journey.between(broken_ns, joined_ns)
+    assert meanwhile[-1].x[3] < 0.5 * meanwhile[0].x[3]
+    assert "driving" in journey.phases(joined_ns, journey.states[-1].source_time_ns)
 
 
 @pytest.mark.check
 def test_a_router_started_again_is_found_by_both(tmp_path: Path, course: Course) -> None:
     with rigged(tmp_path, course, "router") as rig:
-        router, plant, controller = rig.start_router(), rig.start_plant(), rig.start_controller()
-        rig.observer.start(1)
-        rig.drive_on()
+        router = rig.start_router()
+        controller, plant = rig.driving()
         router.kill()
         broken_ns = time.monotonic_ns()
         time.sleep(1.0)
@@ -395,10 +304,6 @@ def test_a_router_started_again_is_found_by_both(tmp_path: Path, course: Course)
         until(lambda: rig.state().seq > seen, "a state through the new router")
         rig.drive_on()
         until(lambda: rig.observer.status("controller")["phase"] == "driving", "it to drive again")
-        rig.observer.stop()
-        for program in (controller, plant, router):
-            program.end()
-        journey = rig.journey()
-        assert journey.off_track_m() < 0.0
-        after = [state for state in journey.states if state.source_time_ns > broken_ns]
-        assert {state.epoch for state in after} == {journey.states[0].epoch}
+        journey = rig.finished(controller, plant, router)
+    after = [state for state in journey.states if state.source_time_ns > broken_ns]
+    assert {state.epoch for state in after} == {journey.states[0].epoch}

@@ -15,8 +15,8 @@ from vehiclemodels.vehicle_parameters import VehicleParameters
 
 from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
-from bayesrace.plant.guard import PlantGuard
 from bayesrace.plant.simulator import Simulator
+from bayesrace.plant.vehicle import PlantGuard
 from bayesrace.vehicles import CarParameters, get_car
 from bayesrace.vehicles.models import dynamic, e_kinematic, top_command
 from bayesrace.vehicles.parts import LinearTyres

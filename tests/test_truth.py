@@ -15,7 +15,7 @@ from bayesrace.integrators import PREDICTION
 from bayesrace.learning.sources import dataset_from_log
 from bayesrace.learning.validation import identity
 from bayesrace.log import LogReader, LogWriter
-from bayesrace.messages import STATE, TRUTH, State, Truth
+from bayesrace.messages import STATE, TRUTH
 from bayesrace.operation.analysis.race import read_race
 from bayesrace.operation.analysis.results import RaceResult
 from bayesrace.operation.analysis.validation import validate_weights
@@ -93,11 +93,6 @@ def test_a_sensor_that_errs_misleads_the_controller_and_learning_alone(
     states, truths = LogReader(log).select(STATE), LogReader(log).select(TRUTH)
     assert [one.seq for one in states] == [one.seq for one in truths]
     assert np.array_equal([one.x for one in truths], exact.x)
-
-
-def test_types_of_truth_and_measurement_differ() -> None:
-    assert not issubclass(Truth, State)
-    assert not issubclass(State, Truth)
 
 
 def judged(folder: Path, measured: Any, truth: bool = True) -> RaceResult:

@@ -12,9 +12,8 @@ from bayesrace.plant.fmu.host import FmuHost
 from bayesrace.plant.fmu.inspection import inspect, steps_s
 from bayesrace.plant.fmu.map import FmuMap, read_map, wire
 from bayesrace.plant.fmu.wiring import Wiring
-from bayesrace.plant.guard import Command
 from bayesrace.plant.simulator import plant_discretisation
-from bayesrace.plant.vehicle import Vehicle
+from bayesrace.plant.vehicle import Command, Vehicle
 from bayesrace.vehicles.models import STATES
 from bayesrace.vehicles.parameters import CarParameters
 

@@ -80,11 +80,12 @@ def _weights() -> GpWeights:
 class Program:
     """A running ``bayesrace`` subcommand."""
 
-    def __init__(self, output: Path, *arguments: str | Path) -> None:
+    def __init__(self, output: Path, *arguments: str | Path, prefix: Sequence[str] = ()) -> None:
+        """``prefix``: a command that runs it, such as ``unshare``."""
         self._output = output
         with output.open("ab") as file:
             self.process = subprocess.Popen(
-                [*COMMAND, *map(str, arguments)],
+                [*prefix, *COMMAND, *map(str, arguments)],
                 stdin=subprocess.DEVNULL,
                 stdout=file,
                 stderr=subprocess.STDOUT,
