@@ -245,9 +245,5 @@ class PurePursuit:
             best = int(squared.argmin())
             if squared[best] <= self._tuning.lost_m**2:
                 return (first + best) % count
-        return int(np.argmin(self._squared_distances(px, py)))
-
-    def _squared_distances(self, px: float, py: float) -> Floats:
         offsets = self._points - (px, py)
-        result: Floats = np.einsum("ij,ij->i", offsets, offsets)
-        return result
+        return int(np.einsum("ij,ij->i", offsets, offsets).argmin())

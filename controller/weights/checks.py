@@ -9,8 +9,8 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Mapping, Sequence
-from functools import lru_cache
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from itertools import product
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -30,7 +30,7 @@ from bayesrace.vehicles.parameters import CarParameters
 from bayesrace.vehicles.parts import GRAVITY_MPS2
 
 __all__ = [
-    "NO_SAMPLES", "Checks", "Correction", "Samples", "Verdict", "compare", "judged",
+    "NO_SAMPLES", "Checks", "Samples", "Verdict", "compare", "judged",
     "plausible_features", "slack_of",
 ]  # fmt: skip
 
@@ -54,37 +54,6 @@ class Samples(NamedTuple):
 
 
 NO_SAMPLES: Final = Samples(np.zeros((0, 6)), np.zeros((0, 3)))
-
-
-class Correction:
-    """The correction that one set of weights makes; None: none."""
-
-    def __init__(self, artefact: Path, car: CarParameters, weights: GpWeights | None) -> None:
-        """InputError if the weights are for another model, too large, or overflow."""
-        self.weights = weights
-        self._nominal, self._corrected = (
-            NativeStep(artefact, car, MpcSettings()) for _ in range(2)
-        )
-        self.step_s = self._nominal.manifest.step_s
-        if weights is not None:
-            self._corrected.set_weights(weights)
-
-    def mean(self, features: Floats) -> Floats:
-        """Of vx, vy, omega (n, 3), per step; NaN where the model has no value."""
-        found = np.full((len(features), len(OUTPUTS)), np.nan)
-        for row, one in zip(found, features, strict=True):
-            x, u = np.concatenate([np.zeros(3), one[:4]]), one[4:]
-            try:
-                corrected = self._corrected.predict(x, u, self.step_s)[3:6].copy()
-                row[:] = corrected - self._nominal.predict(x, u, self.step_s)[3:6]
-            except InputError:  # a state that is absurd, or that the weights make absurd
-                continue
-        return found
-
-    def errors(self, samples: Samples) -> Floats:
-        """What is left of the residuals (n, 3); infinite where the model has no value."""
-        left = samples.residuals - self.mean(samples.features)
-        return np.where(np.isfinite(left), left, np.inf)
 
 
 def plausible_features(car: CarParameters, count: int) -> Floats:
@@ -112,9 +81,9 @@ class Checks:
     """The tests for one controller."""
 
     def __init__(self, settings: GateSettings, artefact: Path, car: CarParameters) -> None:
-        self._settings, self._artefact, self._car = settings, artefact, car
-        self._correction = lru_cache(maxsize=4)(self._make_correction)
-        self._step_s = self._correction(b"").step_s
+        self._settings, self._car = settings, car
+        self._step = NativeStep(artefact, car, MpcSettings())
+        self._step_s = self._step.manifest.step_s
         self._slack = slack_of(car, self._step_s)
 
     def judge(
@@ -133,11 +102,10 @@ class Checks:
         """
         facts: dict[str, Scalar] = {}
         try:
-            new = self._correction(data)
-            if new.weights is None:
-                raise InputError("GP weights: 0 bytes is not the size of a weights file")
-            facts["version"] = new.weights.version
-            self._check_origin(new, self._correction(in_use), accepted_utc_ns)
+            new = decode_weights(data)
+            self._step.set_weights(new)  # InputError if they are for another model, or too large
+            facts["version"] = new.version
+            self._check_origin(new, _decoded(in_use), accepted_utc_ns)
             self._check_bounds(new, recent)
             self._check_own_samples(new)
             probation = len(recent.features) < self._settings.least_samples
@@ -145,16 +113,16 @@ class Checks:
             text = (
                 f"on probation: {len(recent.features)} recent samples are too few to compare"
                 if probation
-                else self._compare(new, recent, {in_use, reference}, facts)
+                else self._compare(new, recent, map(_decoded, {in_use, reference}), facts)
             )
         except InputError as error:
             return Verdict(str(error), facts)
-        return Verdict(text, facts, pack_weights(new.weights))
+        return Verdict(text, facts, pack_weights(new))
 
     def check_start(self, data: bytes) -> None:
         """InputError unless a weights file may drive from the start, before the car has moved."""
-        weights = self._correction(data).weights
-        if weights is not None and any(weights.counts) and not len(weights.sample_features):
+        weights = decode_weights(data)
+        if any(weights.counts) and not len(weights.sample_features):
             raise InputError(
                 f"weights '{weights.version}' hold no samples that they can be checked by; train "
                 "again, or start without them and use 'bayesrace publish'"
@@ -163,15 +131,33 @@ class Checks:
         if not verdict.packed:
             raise InputError(verdict.text)
 
-    def _make_correction(self, data: bytes) -> Correction:
-        weights = decode_weights(data) if data else None
-        return Correction(self._artefact, self._car, weights)
-
-    def _check_origin(self, new: Correction, in_use: Correction, accepted_utc_ns: int) -> None:
-        weights, others, why_not = new.weights, in_use.weights, ""
+    def _after(self, weights: GpWeights | None, features: Floats) -> Floats:
+        """vx, vy, omega (n, 3) a step later, by the model that these weights correct; NaN where it
+        has no value."""
         if weights is None:
-            return
-        made_ns = 0 if others is None else others.created_utc_ns
+            self._step.load_weights(b"")
+        else:
+            self._step.set_weights(weights)
+        found = np.full((len(features), len(OUTPUTS)), np.nan)
+        for row, one in zip(found, features, strict=True):
+            x, u = np.concatenate([np.zeros(3), one[:4]]), one[4:]
+            with suppress(InputError):  # a state that is absurd, or that the weights make absurd
+                row[:] = self._step.predict(x, u, self._step_s)[3:6]
+        return found
+
+    def _mean(self, weights: GpWeights | None, features: Floats) -> Floats:
+        """The correction (n, 3) per step; NaN where a model has no value."""
+        return self._after(weights, features) - self._after(None, features)
+
+    def _errors(self, weights: GpWeights | None, samples: Samples) -> Floats:
+        """What is left of the residuals (n, 3); infinite where a model has no value."""
+        left = samples.residuals - self._mean(weights, samples.features)
+        return np.where(np.isfinite(left), left, np.inf)
+
+    def _check_origin(
+        self, weights: GpWeights, others: GpWeights | None, accepted_utc_ns: int
+    ) -> None:
+        made_ns, why_not = 0 if others is None else others.created_utc_ns, ""
         older_s = (min(made_ns, accepted_utc_ns or time.time_ns()) - weights.created_utc_ns) * 1e-9
         ahead_s = (weights.created_utc_ns - time.time_ns()) * 1e-9
         if weights.car != self._car.name:
@@ -186,15 +172,15 @@ class Checks:
         if why_not:
             raise InputError(f"weights '{weights.version}' are {why_not}")
 
-    def _check_bounds(self, new: Correction, recent: Samples) -> None:
+    def _check_bounds(self, new: GpWeights, recent: Samples) -> None:
         limit = np.array(self._car.tuning.gate.absurd)
         places = {
             "over the car's range": plausible_features(self._car, self._settings.plausible_states),
             "in its recent states": recent.features,
         }
         for where, features in places.items():
-            known = np.isfinite(self._correction(b"").mean(features)).all(axis=1)
-            excess = np.abs(new.mean(features)[known]) / self._step_s
+            known = np.isfinite(self._after(None, features)).all(axis=1)
+            excess = np.abs(self._mean(new, features)[known]) / self._step_s
             if not (excess <= limit).all():  # NaN: the corrected model leaves all bounds
                 worst = ", ".join(f"{value:.3g}" for value in excess.max(axis=0))
                 most = ", ".join(f"{value:g}" for value in limit)
@@ -203,13 +189,12 @@ class Checks:
                     f"rad/s^2) by up to {worst}, and {most} is the most; train again"
                 )
 
-    def _check_own_samples(self, new: Correction) -> None:
+    def _check_own_samples(self, weights: GpWeights) -> None:
         """The weights must predict the samples that they were learned from."""
-        weights = new.weights
-        if weights is None or not len(weights.sample_features):
+        if not len(weights.sample_features):
             return
         samples = Samples(weights.sample_features, weights.sample_residuals)
-        errors, without = new.errors(samples), _rms(samples.residuals)
+        errors, without = self._errors(weights, samples), _rms(samples.residuals)
         # A posterior mean fits its own samples: neither do errors grow, nor are they one-sided.
         better = _rms(errors) <= without + self._slack
         better &= np.abs(errors.mean(axis=0)) <= _ONE_SIDED * without + self._slack
@@ -221,14 +206,18 @@ class Checks:
             )
 
     def _compare(
-        self, new: Correction, recent: Samples, others: set[bytes], facts: dict[str, Scalar]
+        self,
+        new: GpWeights,
+        recent: Samples,
+        others: Iterable[GpWeights | None],
+        facts: dict[str, Scalar],
     ) -> str:
         """What speaks for the weights, on recent samples; InputError if they are worse."""
-        usable = np.isfinite(self._correction(b"").errors(recent)).all(axis=1)
-        rmse = [_rms(self._correction(one).errors(recent)[usable]) for one in others]
+        usable = np.isfinite(self._errors(None, recent)).all(axis=1)
+        rmse, *before = (_rms(self._errors(one, recent)[usable]) for one in (new, *others))
         found = compare(
-            self._settings, self._slack, int(usable.sum()), _rms(new.errors(recent)[usable]),
-            np.min(rmse, axis=0), _rms(recent.residuals[usable]),
+            self._settings, self._slack, int(usable.sum()), rmse, np.min(before, axis=0),
+            _rms(recent.residuals[usable]),
         )  # fmt: skip
         facts |= found.data
         if found.worse:
@@ -237,6 +226,10 @@ class Checks:
                 f"{found.text}; train again, on this car's own laps"
             )
         return found.text
+
+
+def _decoded(data: bytes) -> GpWeights | None:
+    return decode_weights(data) if data else None
 
 
 def _rms(errors: Floats) -> Floats:
