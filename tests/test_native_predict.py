@@ -138,29 +138,6 @@ def test_part_of_a_stage_takes_its_share_of_the_residual(
             np.testing.assert_allclose(predicted, expected, rtol=0, atol=1e-12)
 
 
-def test_there_is_no_jump_at_a_whole_stage(corrected: NativeStep, car: CarParameters) -> None:
-    for x, u in drives(car)[::5]:
-        for stages in (1, 2):
-            if abs(x[6] + stages * TS * u[1]) > car.delta_max_rad:
-                continue
-            whole = corrected.predict(x, u, stages * TS)
-            for near in (stages * TS - 1e-10, stages * TS + 1e-10):
-                np.testing.assert_allclose(corrected.predict(x, u, near), whole, rtol=0, atol=1e-7)
-
-
-def test_two_predictions_in_a_row_are_one(
-    nominal: NativeStep, corrected: NativeStep, car: CarParameters
-) -> None:
-    """Closely without correction; with it as closely as a share of the residual can be."""
-    for x, u in drives(car)[::3]:
-        if abs(x[6] + 0.03 * u[1]) > car.delta_max_rad:
-            continue
-        for step, share in ((nominal, 1e-4), (corrected, 0.15)):
-            whole = step.predict(x, u, 0.03)
-            halves = step.predict(step.predict(x, u, 0.007), u, 0.023)
-            assert np.abs(halves - whole).max() <= share * np.abs(whole - x).max()
-
-
 def test_angle_and_inputs_stop_at_their_limits(corrected: NativeStep, car: CarParameters) -> None:
     x = np.array([0.0, 0, 0, 1.5, 0, 0, car.delta_max_rad - 0.01])
     for duration_s in (0.005, TS, 0.07):

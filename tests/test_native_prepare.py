@@ -1,7 +1,6 @@
 """The preparation phase: saves the step time, and changes nothing else."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
 
 import numpy as np
 import pytest
@@ -14,15 +13,6 @@ from tests.conftest import SETTINGS, Circuit, Make, Problem
 from tests.test_native_time import TS, Clock, residual, solve
 
 DEFAULTS = {name: getattr(MpcSettings(), name) for name in ("early_stop_tol", "iterations")}
-
-
-@dataclass
-class Drive:
-    """What was asked and answered."""
-
-    x: list[tuple[Floats, float]] = field(default_factory=list)
-    u: list[Floats] = field(default_factory=list)
-    iterations: list[int] = field(default_factory=list)
 
 
 def result(step: NativeStep) -> bytes:
@@ -72,57 +62,37 @@ def test_preparing_again_counts_from_the_last_step(make: Make, recorded: list[Pr
             prepared.prepare(expected)
 
 
-def change_weights(step: NativeStep, circuit: Circuit, car: CarParameters) -> None:
-    step.load_weights(b"")
+Between = Callable[[NativeStep, Circuit, CarParameters], object]
 
 
-def change_parameters(step: NativeStep, circuit: Circuit, car: CarParameters) -> None:
-    heavier = SETTINGS.model_copy(update={"q_position": 2.0, "r_duty": 0.02, "margin_m": 0.02})
-    step.set_parameters(car, heavier)
+def changed(**changes: float) -> Between:
+    """Sets the parameters so changed."""
+    return lambda step, _, car: step.set_parameters(car, SETTINGS.model_copy(update=changes))
 
 
-def drop_constraints(step: NativeStep, circuit: Circuit, car: CarParameters) -> None:
-    step.set_parameters(car, SETTINGS.model_copy(update={"constraints": False}))
+BETWEEN: dict[str, Between] = {
+    "other weights": lambda step, *_: step.load_weights(b""),
+    "reset": lambda step, *_: step.reset(),
+    "other parameters": changed(q_position=2.0, r_duty=0.02, margin_m=0.02),
+    "no constraints": changed(constraints=False),
+    "caution": changed(caution=0.95),
+    "path": lambda step, circuit, _: step.set_path(circuit.table),
+    "bad state": lambda step, *_: step.step(np.full(7, np.nan), 0.0),
+    "prediction": lambda step, circuit, _: step.predict(
+        circuit.start(), np.array([0.5, 1.0]), 0.05
+    ),
+}
 
 
-def be_cautious(step: NativeStep, circuit: Circuit, car: CarParameters) -> None:
-    step.set_parameters(car, SETTINGS.model_copy(update={"caution": 0.95}))
-
-
-def reset(step: NativeStep, circuit: Circuit, car: CarParameters) -> None:
-    step.reset()
-
-
-def change_path(step: NativeStep, circuit: Circuit, car: CarParameters) -> None:
-    step.set_path(circuit.table)
-
-
-def bad_state(step: NativeStep, circuit: Circuit, car: CarParameters) -> None:
-    step.step(np.full(7, np.nan), 0.0)
-
-
-def predict(step: NativeStep, circuit: Circuit, car: CarParameters) -> None:
-    step.predict(circuit.start(), np.array([0.5, 1.0]), 0.05)
-
-
-Between = Callable[[NativeStep, Circuit, CarParameters], None]
-
-
-@pytest.mark.parametrize(
-    "between",
-    [
-        change_weights, change_parameters, drop_constraints, be_cautious, reset, change_path,
-        bad_state, predict,
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize("what", BETWEEN)
 def test_what_happens_in_between_is_seen(
-    make: Make, recorded: list[Problem], circuit: Circuit, car: CarParameters, between: Between
+    make: Make, recorded: list[Problem], circuit: Circuit, car: CarParameters, what: str
 ) -> None:
     prepared, plain = make(), make()
     for k, p in enumerate(recorded[:24]):
         if k == 12:
             for one in (prepared, plain):
-                between(one, circuit, car)
+                BETWEEN[what](one, circuit, car)
         assert solve(prepared, p) is solve(plain, p)
         assert result(prepared) == result(plain)
         prepared.prepare()
@@ -187,14 +157,15 @@ def test_the_preparation_ends_within_its_budget(
     assert min(done) == 0
 
 
-def drive(step: NativeStep, circuit: Circuit, budget_s: float) -> Drive:
-    """A lap of a car as the model has it, in which each step is prepared with this budget."""
-    x, d, seen = circuit.start(), 0.0, Drive()
+def drive(
+    step: NativeStep, circuit: Circuit, budget_s: float
+) -> list[tuple[Floats, float, Floats, int]]:
+    """A lap of a car as the model has it, in which each step is prepared with this budget: its
+    states, inputs before, inputs, and iterations."""
+    x, d, seen = circuit.start(), 0.0, []
     for _ in range(150):
         assert step.step(x, d).usable
-        seen.iterations.append(step.info.iterations)
-        seen.x.append((x, d))
-        seen.u.append(step.u.copy())
+        seen.append((x, d, step.u.copy(), step.info.iterations))
         step.prepare(TS, budget_s)
         d, x = float(step.u[0]), step.predict(x, step.u, TS).copy()
     return seen
@@ -202,17 +173,16 @@ def drive(step: NativeStep, circuit: Circuit, budget_s: float) -> Drive:
 
 def test_with_a_budget_the_next_problem_is_solved_ahead(make: Make, circuit: Circuit) -> None:
     """So that nearly all steps need one iteration, from a start nearer to the solution."""
-    ahead, plain = (drive(make(**DEFAULTS), circuit, budget_s) for budget_s in (0.1, 0.0))
-    more = [np.mean(np.array(one.iterations[5:]) > 1) for one in (ahead, plain)]
-    assert more[0] < 0.05 < 0.1 < more[1]
-    error = []
-    for one in (ahead, plain):
-        exact = make(iterations=60, iterations_cold=60, early_stop_tol=0, tolerance=1e-10)
-        solutions = []
-        for x, d in one.x:
+    more, error = [], []
+    for budget_s in (0.1, 0.0):
+        seen = drive(make(**DEFAULTS), circuit, budget_s)
+        more.append(np.mean([iterations > 1 for *_, iterations in seen[5:]]))
+        exact, off = make(iterations=60, iterations_cold=60, tolerance=1e-10), []
+        for x, d, u, _ in seen:
             exact.step(x, d)
-            solutions.append(exact.u.copy())
-        error.append(np.percentile(np.abs(np.array(solutions) - one.u)[:, 1], 95))
+            off.append(abs(exact.u[1] - u[1]))
+        error.append(np.percentile(off, 95))
+    assert more[0] < 0.05 < 0.1 < more[1]
     assert error[0] < 0.5 * error[1]
 
 

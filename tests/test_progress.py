@@ -21,7 +21,7 @@ from bayesrace.vehicles import CarParameters
 from bayesrace.vehicles.models import dynamic, e_kinematic
 from tests.conftest import SETTINGS, Circuit, discrete, offset_line
 from tests.test_native_planner import nearest
-from tests.test_native_prepare import Between, change_weights, reset, result
+from tests.test_native_prepare import BETWEEN, Between, result
 from tests.test_native_step import EXACT, FROM_OUR_PLAN, TIGHT_IPOPT
 from tests.test_native_time import Clock
 
@@ -116,16 +116,15 @@ def test_the_reference_is_where_the_plan_is_on_the_line(
             assert pace @ way == pytest.approx((ahead - behind) / 0.02, abs=0.06 * np.hypot(*pace))
 
 
-def nothing(step: NativeStep, circuit: Circuit, car: CarParameters) -> None:
-    """The drive goes on."""
-
-
-def another_path(step: NativeStep, circuit: Circuit, car: CarParameters) -> None:
+def another_path(step: NativeStep, circuit: Circuit, _: CarParameters) -> None:
     line = offset_line(circuit.track, -0.05, 4.0, 2.0)
     step.set_path(make_path_table(circuit.track, line, circuit.table.spacing_m))
 
 
-@pytest.mark.parametrize("between", [nothing, another_path, change_weights, reset])
+@pytest.mark.parametrize(
+    "between", [lambda *_: None, another_path, BETWEEN["other weights"], BETWEEN["reset"]],
+    ids=["nothing", "another path", "other weights", "reset"],
+)  # fmt: skip
 def test_prepared_steps_are_the_same_to_the_bit(
     artefact: Path, car: CarParameters, weights: GpWeights, circuit: Circuit, between: Between
 ) -> None:
