@@ -52,7 +52,7 @@ br_mpc_error br_cycle_init(void *memory, size_t size, const br_controller *contr
     memset(cycle, 0, sizeof *cycle);
     cycle->controller = *controller;
     cycle->halted = hold ? BR_PHASE_READY : 0;
-    br_stream_init(&cycle->stream);
+    cycle->stream.ended = cycle->stream.silent = 1;
     cycle->decision = (br_decision){.status = BR_HALTED, .level = BR_STOP};
     *out = cycle;
     return BR_OK;

@@ -15,7 +15,6 @@ typedef struct {
     int ended, silent; /* the run is over; nothing has come for long */
 } br_stream;
 
-void br_stream_init(br_stream *stream);
 br_reception br_stream_accept(br_stream *stream, const br_measured *state, br_counters *counters);
 int br_stream_forget(br_stream *stream, br_counters *counters);
 

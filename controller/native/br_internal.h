@@ -289,6 +289,18 @@ static inline const double *br_theta(const br_mpc_parameters *parameters) {
     return (const double *)parameters; /* the problem's come first, all of them doubles */
 }
 
+#define BR_LIST(...) {__VA_ARGS__}
+
+/* Calls a function that CasADi has generated (br_model.h), with its working memory on the stack. */
+#define BR_CALL(function, arguments, results)                   \
+    do {                                                        \
+        const casadi_real *arg_[function##_SZ_ARG] = arguments; \
+        casadi_real *res_[function##_SZ_RES] = results;         \
+        casadi_int iw_[function##_SZ_IW + 1];                   \
+        casadi_real w_[function##_SZ_W + 1];                    \
+        function(arg_, res_, iw_, w_, 0);                       \
+    } while (0)
+
 /* Whether the stage is the first of its block. */
 static inline int br_opens_block(int k) { return k == 0 || BR_BLOCK_OF(k) > BR_BLOCK_OF(k - 1); }
 

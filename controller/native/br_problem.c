@@ -17,57 +17,37 @@ void br_evaluate_terms(br_mpc *mpc) {
     if (mpc->valid[BR_TERMS]) return;
     mpc->valid[BR_TERMS] = 1;
     const double *theta = br_theta(&mpc->parameters);
-    casadi_int iw[br_terms_SZ_IW + 1];
-    casadi_real w[br_terms_SZ_W + 1];
     for (int k = 0; k < BR_N; ++k) {
-        const double last = k == BR_N - 1;
-        const casadi_real *arg[br_terms_SZ_ARG] = {mpc->plan.x[k + 1],
-                                                   mpc->plan.u[k],
-                                                   input_before(mpc, k),
-                                                   &last,
-                                                   (const double *)&mpc->reference[k],
-                                                   theta};
-        casadi_real *res[br_terms_SZ_RES] = {(double *)&mpc->qp.terms[k]};
-        br_terms(arg, res, iw, w, 0);
+        const double last = k == BR_N - 1, *reference = (const double *)&mpc->reference[k];
+        BR_CALL(br_terms,
+                BR_LIST(mpc->plan.x[k + 1], mpc->plan.u[k], input_before(mpc, k), &last, reference,
+                        theta),
+                BR_LIST((double *)&mpc->qp.terms[k]));
         br_caution_tighten(mpc, k, &mpc->qp.terms[k]);
     }
 }
 
 void br_evaluate_curvature(br_mpc *mpc) {
     const double *theta = br_theta(&mpc->parameters);
-    casadi_int iw[br_curvature_SZ_IW + 1];
-    casadi_real w[br_curvature_SZ_W + 1];
     for (int k = 0; k < BR_N; ++k) {
-        const double last = k == BR_N - 1;
+        const double last = k == BR_N - 1, *reference = (const double *)&mpc->reference[k];
         double multiplier[BR_NR + 1];
         for (int r = 0; r < BR_NR; ++r) multiplier[r] = mpc->plan.multiplier[BR_ROW(r, k)];
         br_stage_curvature *out = &mpc->qp.second[k];
-        const casadi_real *arg[br_curvature_SZ_ARG] = {mpc->plan.x[k + 1],
-                                                       mpc->plan.u[k],
-                                                       input_before(mpc, k),
-                                                       &last,
-                                                       (const double *)&mpc->reference[k],
-                                                       theta,
-                                                       multiplier};
-        casadi_real *res[br_curvature_SZ_RES] = {out->cost_xx, out->rows_xx, out->uu[0]};
-        br_curvature(arg, res, iw, w, 0);
+        BR_CALL(br_curvature,
+                BR_LIST(mpc->plan.x[k + 1], mpc->plan.u[k], input_before(mpc, k), &last, reference,
+                        theta, multiplier),
+                BR_LIST(out->cost_xx, out->rows_xx, out->uu[0]));
     }
 }
 
 void br_evaluate_bounds(br_mpc *mpc) {
-    const casadi_real *arg[br_bounds_SZ_ARG] = {mpc->x0, br_theta(&mpc->parameters)};
-    casadi_real *res[br_bounds_SZ_RES] = {mpc->u_lower, mpc->u_upper};
-    casadi_int iw[br_bounds_SZ_IW + 1];
-    casadi_real w[br_bounds_SZ_W + 1];
-    br_bounds(arg, res, iw, w, 0);
+    BR_CALL(br_bounds, BR_LIST(mpc->x0, br_theta(&mpc->parameters)),
+            BR_LIST(mpc->u_lower, mpc->u_upper));
 }
 
 void br_evaluate_penalties(br_mpc *mpc) {
-    const casadi_real *arg[br_penalties_SZ_ARG] = {br_theta(&mpc->parameters)};
-    casadi_real *res[br_penalties_SZ_RES] = {mpc->qp.penalty};
-    casadi_int iw[br_penalties_SZ_IW + 1];
-    casadi_real w[br_penalties_SZ_W + 1];
-    br_penalties(arg, res, iw, w, 0);
+    BR_CALL(br_penalties, BR_LIST(br_theta(&mpc->parameters)), BR_LIST(mpc->qp.penalty));
     for (int r = 0; r < BR_NR; ++r) {
         if (!BR_ROW_SOFT[r] || mpc->qp.penalty[r] > 0) continue;
         for (int k = 0; k < BR_N; ++k) { /* off: no warm start from it */
@@ -80,12 +60,7 @@ void br_evaluate_penalties(br_mpc *mpc) {
 /* The problem's first guess of the input at the measured state; share: see Symbols. */
 void br_first_guess(const br_mpc *mpc, const double u_before[BR_NU], double share,
                     double u[BR_NU]) {
-    const casadi_real *arg[br_guess_SZ_ARG] = {mpc->x0, u_before, &share,
-                                               br_theta(&mpc->parameters)};
-    casadi_real *res[br_guess_SZ_RES] = {u};
-    casadi_int iw[br_guess_SZ_IW + 1];
-    casadi_real w[br_guess_SZ_W + 1];
-    br_guess(arg, res, iw, w, 0);
+    BR_CALL(br_guess, BR_LIST(mpc->x0, u_before, &share, br_theta(&mpc->parameters)), BR_LIST(u));
 }
 
 /* Each within its limits, and all of them consistent. */
@@ -97,11 +72,7 @@ int br_valid_parameters(const br_mpc_parameters *parameters) {
         if (BR_PARAMETER_POSITIVE[i] && theta[i] <= 0) return 0;
     }
     double margin = 0;
-    const casadi_real *arg[br_valid_SZ_ARG] = {theta};
-    casadi_real *res[br_valid_SZ_RES] = {&margin};
-    casadi_int iw[br_valid_SZ_IW + 1];
-    casadi_real w[br_valid_SZ_W + 1];
-    br_valid(arg, res, iw, w, 0);
+    BR_CALL(br_valid, BR_LIST(theta), BR_LIST(&margin));
     return margin > 0;
 }
 

@@ -15,20 +15,12 @@ enum { NW = BR_NV + BR_NE }; /* columns of w */
 /* F, and its Jacobian if that is not NULL. */
 static void nominal(const double x[BR_NX], const double u[BR_NU], const double e[BR_NE],
                     double f[BR_NX], double *jacobian) {
-    const casadi_real *arg[br_linearise_SZ_ARG] = {x, u, e};
-    casadi_real *res[br_linearise_SZ_RES] = {f, jacobian};
-    casadi_int iw[br_linearise_SZ_IW + 1];
-    casadi_real w[br_linearise_SZ_W + 1];
-    br_linearise(arg, res, iw, w, 0);
+    BR_CALL(br_linearise, BR_LIST(x, u, e), BR_LIST(f, jacobian));
 }
 
 static void nominal_hessian(const double x[BR_NX], const double u[BR_NU], const double e[BR_NE],
                             const double lambda[BR_NX], double hessian[NW][NW]) {
-    const casadi_real *arg[br_hessian_SZ_ARG] = {x, u, e, lambda};
-    casadi_real *res[br_hessian_SZ_RES] = {hessian[0]};
-    casadi_int iw[br_hessian_SZ_IW + 1];
-    casadi_real w[br_hessian_SZ_W + 1];
-    br_hessian(arg, res, iw, w, 0);
+    BR_CALL(br_hessian, BR_LIST(x, u, e, lambda), BR_LIST(hessian[0]));
 }
 
 /* J += F_e M, columns of the features. */
@@ -153,11 +145,7 @@ void br_stage_advance(const br_gp *gp, const double x[BR_NX], const double u[BR_
     br_stage_features(x, u, z);
     if (gp && gp->any) br_gp_mean(gp, z, mean);
     for (int j = 0; j < BR_NE; ++j) mean[j] *= duration / BR_TS;
-    const casadi_real *arg[br_advance_SZ_ARG] = {x, u, mean, &duration};
-    casadi_real *res[br_advance_SZ_RES] = {x_next};
-    casadi_int iw[br_advance_SZ_IW + 1];
-    casadi_real w[br_advance_SZ_W + 1];
-    br_advance(arg, res, iw, w, 0);
+    BR_CALL(br_advance, BR_LIST(x, u, mean, &duration), BR_LIST(x_next));
 }
 
 /* --- the plan --- */
@@ -187,20 +175,13 @@ static void advance(const br_mpc *mpc, const br_gp *gp, double x[BR_NX], const d
                     double duration) {
     const double *theta = br_theta(&mpc->parameters);
     double acting[BR_NU], unlimited[BR_NX];
-    const casadi_real *arg[br_acting_SZ_ARG + br_reached_SZ_ARG] = {x, u, &duration, theta};
-    casadi_real *res[br_acting_SZ_RES + br_reached_SZ_RES] = {acting};
-    casadi_int iw[br_acting_SZ_IW + br_reached_SZ_IW + 1];
-    casadi_real w[br_acting_SZ_W + br_reached_SZ_W + 1];
-    br_acting(arg, res, iw, w, 0);
+    BR_CALL(br_acting, BR_LIST(x, u, &duration, theta), BR_LIST(acting));
     if (duration == BR_TS) {
         stage_next(gp, x, acting, unlimited);
     } else {
         br_stage_advance(gp, x, acting, duration, unlimited);
     }
-    arg[0] = unlimited;
-    arg[1] = theta;
-    res[0] = x;
-    br_reached(arg, res, iw, w, 0);
+    BR_CALL(br_reached, BR_LIST(unlimited, theta), BR_LIST(x));
 }
 
 br_mpc_error br_predict(const br_mpc *mpc, const double x[BR_NX], const double u[BR_NU],

@@ -16,8 +16,6 @@
 #define FARTHEST 256
 #define CONFIRMED 4 /* states in a row that belong together are a stream of their own */
 
-void br_stream_init(br_stream *stream) { *stream = (br_stream){.ended = 1, .silent = 1}; }
-
 static int same_run(const br_measured *a, const br_measured *b) {
     return a->epoch == b->epoch && a->run == b->run;
 }
