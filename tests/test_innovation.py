@@ -3,7 +3,6 @@ it was learned is driven with care."""
 
 import numpy as np
 import pytest
-from rich.console import Console
 
 from bayesrace.arrays import Floats
 from bayesrace.controller.assembly import PredictiveController, compiled_controller
@@ -12,17 +11,14 @@ from bayesrace.controller.native_step import NativeStep
 from bayesrace.controller.process_settings import ControllerSettings
 from bayesrace.controller.settings import MpcSettings
 from bayesrace.errors import InputError
-from bayesrace.gp.weights import GpWeights, read_weights
+from bayesrace.gp.weights import GpWeights
 from bayesrace.integrators import PREDICTION
 from bayesrace.learning.validation import predictive_sigma
-from bayesrace.messages import State
 from bayesrace.operation.closed_loop import ClosedLoop, built_in_car
-from bayesrace.operation.preparation import prepare
-from bayesrace.operation.settings import RaceSettings
-from bayesrace.operation.terminal.terminal import stages_on
 from bayesrace.vehicles import CarParameters
 from tests.conftest import CAUTIOUS, Circuit, Make
 from tests.cycle_rig import state
+from tests.racing import racing
 
 STEP_S = PREDICTION.step_s
 
@@ -153,59 +149,44 @@ def test_one_wrong_measurement_does_not_widen_the_band_for_long(
     assert 20 < step.info.widening < 25
 
 
-class TestCycle:
-    """What the control cycle shows the controller: states that follow one another."""
-
-    @pytest.fixture
-    def loop(self, step: NativeStep, car: CarParameters) -> Driver:
-        """Its sensors are trusted: what these states say contradicts itself."""
-        settings = ControllerSettings(stale_s=0.1, sensor_tolerance=0)
-        return Driver(PredictiveController(step), car, settings)
-
-    @staticmethod
-    def widening(driver: Driver, states: list[State]) -> float:
-        """After these states, each answered at once."""
-        for one in states:
-            driver.observe(one)
-            driver.decide(one.time_s)
-            driver.prepare(STEP_S)
-        assert driver.output is not None
-        return driver.output.numbers["widening"]
-
-    @staticmethod
-    def states(circuit: Circuit, numbers: list[int], vx: float = 1.0) -> list[State]:
-        """Of a car whose yaw rate is another each time, which no model predicts."""
-        states = []
-        for number in numbers:
-            x = circuit.start().copy()
-            x[3], x[5] = vx, 8.0 * (-1) ** number
-            states.append(state(number, time_s=STEP_S * number, x=tuple(x)))
-        return states
-
-    def test_states_in_a_row_widen_the_band(self, loop: Driver, circuit: Circuit) -> None:
-        assert self.widening(loop, self.states(circuit, list(range(12)))) > 2
-
-    @pytest.mark.parametrize(
-        ("numbers", "vx"), [(list(range(0, 24, 2)), 1.0), (list(range(12)), 0.0)]
-    )
-    def test_gaps_and_a_standing_car_do_not(
-        self, loop: Driver, circuit: Circuit, numbers: list[int], vx: float
-    ) -> None:
-        assert self.widening(loop, self.states(circuit, numbers, vx)) == 1.0
+@pytest.mark.parametrize(
+    ("numbers", "vx_mps", "widens"),
+    [(range(12), 1.0, True), (range(0, 24, 2), 1.0, False), (range(12), 0.0, False)],
+    ids=["in a row", "gaps", "standing"],
+)
+def test_the_cycle_shows_states_in_a_row_of_a_car_that_moves(
+    step: NativeStep,
+    car: CarParameters,
+    circuit: Circuit,
+    numbers: range,
+    vx_mps: float,
+    widens: bool,
+) -> None:
+    """Its yaw rate is another each time, which no model predicts, and no monitor would believe."""
+    settings = ControllerSettings(stale_s=0.1, sensor_tolerance=0)
+    driver = Driver(PredictiveController(step), car, settings)
+    for number in numbers:
+        x = circuit.start()
+        x[3], x[5] = vx_mps, 8.0 * (-1) ** number
+        driver.observe(state(number, x=tuple(x)))
+        driver.decide(number * STEP_S)
+        driver.prepare(STEP_S)
+    assert driver.output is not None
+    widening = driver.output.numbers["widening"]
+    assert widening > 2 if widens else widening == 1.0
 
 
 @pytest.mark.check
 def test_a_car_that_has_lost_grip_since_it_was_learned_stays_on_the_track() -> None:
     """A fifth of the tyre forces of the car that the weights and the line are made for."""
-    settings = RaceSettings(track="random:8")
-    with stages_on(Console(quiet=True)) as stages:
-        files = prepare(settings, (settings.track,), stages)
-    weights, on, line = read_weights(files.weights), files.first.track, files.first.line
-    slippery = settings.model_copy(update={"true_grip": 0.8}).true_car
+    race = racing("random:8")
+    slippery = built_in_car(race.car.model_copy(update={"tyres": race.car.tyres.with_grip(0.8)}))
     samples = []
     for mpc in (MpcSettings(caution=0.0), MpcSettings()):
-        controller = compiled_controller(files.artefacts[0], settings.car, on, line, weights, mpc)
-        loop = ClosedLoop(settings.car, on, line, controller, built_in_car(slippery))
+        controller = compiled_controller(
+            race.artefact, race.car, race.track, race.line, race.weights, mpc
+        )
+        loop = ClosedLoop(race.car, race.track, race.line, controller, slippery)
         samples.append(int((loop.drive(2).off_track_m > 0).sum()))
     assert samples[0] > 10
     assert samples[1] == 0
