@@ -17,15 +17,12 @@ from fmpy.model_description import (
 )
 
 from bayesrace.arrays import Floats
-from bayesrace.plant.fmu.inspection import unit_of
 from bayesrace.plant.fmu.wiring import STATES, Wiring
 
 __all__ = [
     "OWN", "STATE", "TOLERANCE", "U", "assert_same", "description", "given",
     "our_names", "own_fmu", "read", "replacing", "taken", "values", "variable", "write_fmu",
 ]  # fmt: skip
-
-unit_of("m")  # loads pint, which takes longer than Hypothesis allows an example
 
 _INITIAL: Final = {"input": "exact", "parameter": "exact", "output": "calculated"}
 _VARIABILITY: Final = {"parameter": "fixed"}

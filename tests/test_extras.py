@@ -19,7 +19,7 @@ from tests.command_line import Cli, refused
 from tests.programs import ROOT, peanut
 
 NEEDED = {"cffi", "eclipse-zenoh", "msgpack", "numpy", "pydantic", "typer"}
-NOT_NEEDED = {"casadi", "fmpy", "jinja2", "matplotlib", "mcap", "pint", "scipy"}
+NOT_NEEDED = {"casadi", "fmpy", "jinja2", "matplotlib", "mcap", "scipy"}
 
 
 @pytest.mark.check

@@ -8,6 +8,7 @@ from typing import Any, Final
 import numpy as np
 import pytest
 from hypothesis import given as those
+from hypothesis import settings
 from hypothesis import strategies as st
 
 from bayesrace.arrays import Floats
@@ -116,6 +117,7 @@ VELOCITIES: Final[dict[str, Rule]] = {
 
 
 @pytest.mark.parametrize("name", [*HEADINGS, *VELOCITIES])
+@settings(deadline=None)
 @those(
     body=st.tuples(st.floats(-40, 40), st.floats(-3, 3), st.floats(-1, 1)),
     steps=st.lists(st.floats(-math.pi + 1e-6, math.pi - 1e-6), max_size=20),

@@ -10,13 +10,11 @@ import tempfile
 import zipfile
 import zlib
 from collections.abc import Mapping, Sequence
-from functools import cache
 from importlib.metadata import distribution
 from math import isfinite
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-import pint
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from bayesrace.codegen.fmu.build import (
@@ -45,9 +43,11 @@ _TYPES: Final = {
     2: {"real": "Real", "integer": "Integer", "boolean": "Boolean"},
     3: {"real": "Float64", "integer": "Int32", "boolean": "Boolean"},
 }
-_BASE: Final = {"kilogram": "kg", "meter": "m", "second": "s", "radian": "rad"}
-
-_registry: Final[Any] = cache(pint.UnitRegistry)
+_BASE: Final = {
+    "kg": {"kg": 1}, "m": {"m": 1}, "s": {"s": 1}, "rad": {"rad": 1},
+    "N": {"kg": 1, "m": 1, "s": -2}, "1": {},
+}  # fmt: skip
+"""Exponents of base units."""
 
 
 class Part(NamedTuple):
@@ -158,12 +158,14 @@ def _build_description(definition: FmuDefinition, linked: Sequence[str]) -> byte
 
 
 def _base_units(unit: str) -> dict[str, int]:
-    """Exponents of kg, m, s, rad in a unit like ``N.s2/m2``; InputError if it has a factor."""
-    expression = re.sub(r"([a-z])(-?[0-9])", r"\1**\2", unit, flags=re.IGNORECASE)
-    base = _registry().Quantity(expression.replace(".", "*")).to_base_units()
-    if base.magnitude != 1:
-        raise InputError(f"unit '{unit}' is not made of kg, m, s and rad alone")
-    return {_BASE[name]: int(power) for name, power in base.unit_items()}
+    """Exponents of kg, m, s, rad in a unit like ``N.s2/m2``; InputError if it has others."""
+    exponents = dict.fromkeys(("kg", "m", "rad", "s"), 0)
+    for over, name, power in re.findall(r"(/?)([A-Za-z]+|1)([0-9]*)", unit):
+        if name not in _BASE:
+            raise InputError(f"unit '{unit}' is not made of {', '.join(_BASE)} alone")
+        for base, exponent in _BASE[name].items():
+            exponents[base] += exponent * int(power or 1) * (-1 if over else 1)
+    return {base: exponent for base, exponent in exponents.items() if exponent}
 
 
 def _number(value: float, kind: str) -> str:

@@ -26,7 +26,7 @@ __all__ = ["app", "main"]
 _INTERRUPTED: Final = 130
 
 _EXTRAS: Final = {
-    "fmu": ("fmpy", "pint"),
+    "fmu": ("fmpy",),
     "race": (
         "PIL", "casadi", "contourpy", "jinja2", "lz4", "matplotlib", "mcap", "rich",
         "scipy", "sklearn", "threadpoolctl", "yaml", "zstandard",

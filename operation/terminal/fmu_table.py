@@ -9,7 +9,7 @@ from rich.text import Text
 
 from bayesrace.operation.terminal import printable
 from bayesrace.operation.terminal.terminal import plain_table
-from bayesrace.plant.fmu.inspection import items_of, range_of, steps_s, unit_of
+from bayesrace.plant.fmu.inspection import items_of, range_of, steps_s
 
 __all__ = ["fmu_table"]
 
@@ -70,13 +70,10 @@ def _head(fmu: Any, platforms: str) -> Iterator[Text]:
 
 
 def _cells(variable: Any) -> list[Text]:
-    unit = variable.unit or ""
-    # A unit that is not known has to be in the map.
-    style = "yellow" if unit not in ("", "-") and unit_of(unit) is None else ""
     return [
         Text(printable(variable.name)),
         Text(variable.type + ("[]" if variable.dimensions else "")),
-        Text(printable(unit), style=style),
+        Text(printable(variable.unit or "")),
         Text(_short(variable.start)),
         Text(_range(variable)),
         Text(printable(variable.description or "")),

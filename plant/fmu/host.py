@@ -32,7 +32,7 @@ __all__ = ["FmuHost"]
 
 _WORKER: Final = "bayesrace.plant.fmu.worker"
 
-_GOODBYE_S: Final = 0.5
+_GOODBYE_S: Final = 2.0
 """For the FMU to free what it holds, when it is not needed any more."""
 
 _SHOWN: Final = 1 << 16

@@ -1,8 +1,6 @@
 """An FMU file: its description read, a map to fill in written, its content unpacked; units.
 
-Every fault of the file is an InputError. Pint knows the names of units that an FMU declares or a
-map names. It takes an angle for a plain number; here the two differ, because a duty cycle in
-degrees is a mistake.
+Every fault of the file is an InputError.
 """
 
 import json
@@ -10,10 +8,8 @@ import math
 import re
 import zipfile
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
-from functools import cache
 from pathlib import Path, PurePosixPath
 from string import Template
 from typing import Any, Final
@@ -25,8 +21,8 @@ from bayesrace.errors import InputError
 from bayesrace.plant.fmu.wiring import COMMANDS, STATES
 
 __all__ = [
-    "FREQUENCY", "Unit", "blank_map", "extract", "inspect", "is_readable", "is_real", "is_settable",
-    "items_of", "library", "platforms", "range_of", "steps_s", "to_si", "unit_of",
+    "blank_map", "extract", "factor_of", "inspect", "is_readable", "is_real", "is_settable",
+    "items_of", "library", "platforms", "range_of", "steps_s",
 ]  # fmt: skip
 
 _MOST_BYTES: Final = 2 << 30
@@ -35,11 +31,23 @@ _MOST_BYTES: Final = 2 << 30
 _LARGEST_XML: Final = 16_000_000
 """Bytes of a model description; a hundred thousand variables."""
 
-_SPELLED: Final = re.compile(r"(?:[^\W\d]+|[°%·²³()\s]|\*(?!\*)|/|\^-?\d(?!\d)|1(?=\s*/|$))+")
-"""Units, products and powers of one digit: pint computes what it is given, 9^9^9 for days."""
-
-FREQUENCY: Final = {"second": -1.0}
-"""Powers of a unit such as 1/min, which leaves open what it counts."""
+_UNITS: Final[dict[str, dict[str, float]]] = {
+    "m": {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "km": 1e3, "in": 0.0254, "ft": 0.3048},
+    "m/s": {
+        "m/s": 1.0, "mm/s": 1e-3, "cm/s": 1e-2, "km/h": 1 / 3.6, "kmph": 1 / 3.6, "mph": 0.44704,
+        "ft/s": 0.3048,
+    },
+    "m/s2": {"m/s2": 1.0},
+    "rad": {"rad": 1.0, "1": 1.0, "deg": math.pi / 180, "°": math.pi / 180, "turn": 2 * math.pi},
+    "rad/s": {
+        "rad/s": 1.0, "1/s": 1.0, "deg/s": math.pi / 180, "°/s": math.pi / 180,
+        "rpm": math.pi / 30, "rev/min": math.pi / 30,
+    },
+    "1": {"1": 1.0, "%": 0.01},
+}  # fmt: skip
+"""Of each SI unit, factors from others. Not here: what leaves open whether it counts turns or
+radians, such as 1/min and Hz, and angles for a plain number, because a duty cycle in degrees is a
+mistake."""
 
 _CONTROL: Final = re.compile(r"[\x00-\x1f\x7f\x85\u2028\u2029]+")
 
@@ -157,7 +165,8 @@ def blank_map(fmu: Any) -> str:
     variables = {one.name: one for one in fmu.modelVariables}
     lines = {"input": "", "parameter": "", "output": ""}
     for one in variables.values():
-        if one.causality == "input" and _agrees(one, COMMANDS.get(one.name)):
+        ours = one.causality == "input" and one.name in COMMANDS
+        if ours and _agrees(one, COMMANDS[one.name]):
             lines["input"] += f'{one.name} = "{one.name}"\n'
         elif one.causality in ("input", "parameter"):
             lines[one.causality] += f"# {_CONTROL.sub(' ', _blank(one))}\n"
@@ -170,11 +179,10 @@ def blank_map(fmu: Any) -> str:
     return _MAP.substitute(lines, name=_CONTROL.sub(" ", str(fmu.modelName)), step_s=step_s)
 
 
-def _agrees(variable: Any, unit: str | None) -> bool:
+def _agrees(variable: Any, unit: str) -> bool:
     """Whether it is a single real number in just this unit."""
-    own, ours = unit_of(variable.unit), unit_of(unit)
-    same = own and ours and (own.factor, own.powers) == (ours.factor, ours.powers)
-    return bool(same and is_real(variable) and not variable.dimensions)
+    same = factor_of(variable.unit, unit) == 1.0
+    return same and is_real(variable) and not variable.dimensions
 
 
 def _blank(variable: Any) -> str:
@@ -229,59 +237,9 @@ def library(path: Path, folder: Path, fmu: Any) -> Path:
     )
 
 
-@dataclass(frozen=True, slots=True)
-class Unit:
-    """A unit by name, as a multiple of powers of pint's base units, radian among them."""
-
-    name: str
-    factor: float
-    powers: Mapping[str, float]
-
-    def agrees(self, other: "Unit") -> bool:
-        """Whether both measure the same, an angle left open by one of them included."""
-        plain = [{k: v for k, v in one.powers.items() if k != "radian"} for one in (self, other)]
-        return plain[0] == plain[1] and math.isclose(self.factor, other.factor, rel_tol=1e-4)
-
-
-@cache
-def _registry() -> Any:
-    import pint  # takes half a second, and the built-in car needs none of it
-
-    registry: Any = pint.UnitRegistry()
-    registry.define("@alias kilometer_per_hour = kmph")  # or it reads as thousands of mph
-    registry.define("@alias turn = rev")
-    return registry
-
-
-@cache
-def unit_of(name: str | None) -> Unit | None:
-    """The unit called ``name``, also as FMI tools spell it (N.m, m/s2, rad.s-1); None if it is not
-    known."""
-    spelled = re.sub(r"([^\W\d_])(-?\d+)", r"\1^\2", (name or "").strip().replace(".", "*"))
-    if not name or len(name) > 60 or not _SPELLED.fullmatch(spelled):
-        return None
-    try:
-        one = _registry().Quantity(1.0, spelled).to_root_units()
-        powers = {str(base): float(power) for base, power in one.unit_items()}
-        factor = float(one.magnitude)
-    except Exception:  # pint raises what its tokenizer, parser and converters raise
-        return None
-    return Unit(name, factor, powers) if math.isfinite(factor) else None
-
-
-def to_si(unit: Unit, wanted: str) -> float:
-    """Factor from a value in ``unit`` to one in the SI unit ``wanted``.
-
-    Raises InputError for another dimension, and for a frequency that may count turns or radians.
-    """
-    si = unit_of(wanted)
-    assert si is not None, wanted  # noqa: S101  the car's own units are known
-    same = "radian" not in unit.powers and unit.agrees(si)  # 1 and 1/s are radians, as SI has them
-    if unit.powers == si.powers or (same and "Hz" not in unit.name):
-        return unit.factor / si.factor
-    if unit.powers == FREQUENCY and wanted == "rad/s":
-        raise InputError(
-            f'\'{unit.name}\' may count turns or radians: say unit = "rpm", "rad/min" or the like'
-        )
-    target = "a plain number" if wanted == "1" else f"'{wanted}'"
-    raise InputError(f"'{unit.name}' does not convert to {target}")
+def factor_of(unit: str | None, wanted: str) -> float | None:
+    """Factor from a value in ``unit``, also as FMI tools spell it (m.s-1), to one in the SI unit
+    ``wanted``; None if it does not convert."""
+    spelled = re.sub(r"[.*· ]?([a-z]+)\^?-(\d)$", r"/\1\2", unit or "")
+    spelled = re.sub(r"(?<=/[a-z])1$", "", spelled).replace("^2", "2").replace("²", "2")
+    return _UNITS[wanted].get(spelled)

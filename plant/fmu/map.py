@@ -20,14 +20,12 @@ from pydantic import Discriminator, Field, Tag, model_validator
 from bayesrace.errors import InputError, faults_in
 from bayesrace.files import parse_toml, read_text
 from bayesrace.plant.fmu.inspection import (
-    FREQUENCY,
+    factor_of,
     is_readable,
     is_real,
     is_settable,
     items_of,
     range_of,
-    to_si,
-    unit_of,
 )
 from bayesrace.plant.fmu.wiring import COMMANDS, QUANTITIES, STATES, VELOCITIES, Link, Wiring
 
@@ -276,7 +274,7 @@ class _Matching:
         sources = {link.quantity for link in self._starts}
         for link in self._outputs:
             one = self._variables[link.variable]
-            taken = link.quantity in sources or one.name in self._map.start
+            taken = link.quantity in sources or one.name in {*self._map.start, *self._fixed}
             starts = one.initial == "exact" and is_settable(one) and not taken
             if link.quantity in STATES and starts:
                 scale, offset = 1.0 / link.scale, -link.offset / link.scale
@@ -296,20 +294,17 @@ class _Matching:
     ) -> None:
         """A variable that is set: by one of the quantities, or once by a constant."""
         variable = self._find(name)
-        home = {"input": "inputs", "parameter": "parameters"}.get(variable.causality, "start")
-        if not is_settable(variable):
-            home = ""
-        if section != home and (section, home) != ("start", "parameters"):
-            raise InputError(
-                f"'{name}' is a {variable.variability} {variable.causality}: "
-                + (f"only [{home}] can set it" if home else "it cannot be set")
-            )
+        wrong = section == "inputs" and variable.causality != "input"
+        if wrong or not is_settable(variable):
+            kind = f"{variable.variability} {variable.causality}"
+            raise InputError(f"'{name}' is a {kind}: [{section}] cannot set it")
         if not isinstance(entry, Driven):
             self._fixed[name] = self._constant(variable, entry)
             return
         if entry.source not in quantities:
             raise InputError(f"from = '{entry.source}' is none of {', '.join(quantities)}")
-        wanted, links = quantities[entry.source], self._inputs if home == "inputs" else self._starts
+        wanted = quantities[entry.source]
+        links = self._inputs if section == "inputs" else self._starts
         scale = self._factor(entry, self._real(name), wanted)
         scale = scale if entry.scale else 1.0 / scale
         sign, offset = entry.sign, entry.offset
@@ -337,19 +332,21 @@ class _Matching:
         map nor the FMU names a unit, which is SI then."""
         if entry.scale is not None:
             return entry.scale
-        named, declared = unit_of(entry.unit), unit_of(variable.unit)
-        unit, name = (named, entry.unit) if entry.unit is not None else (declared, variable.unit)
-        if unit is None and name not in (None, "", "-"):
+        unit = variable.unit if entry.unit is None else entry.unit
+        if unit in (None, "", "-"):
+            return 1.0
+        factor, declared = factor_of(unit, wanted), factor_of(variable.unit, wanted)
+        if factor is None:
             raise InputError(
-                f"the unit '{name}' of '{variable.name}' is not known; give `unit`, or `scale` "
-                "instead of it"
+                f"the unit '{unit}' of '{variable.name}' does not convert to '{wanted}': correct "
+                "`unit`, or give `scale` instead of it"
             )
-        if named and declared and not (named.agrees(declared) or declared.powers == FREQUENCY):
+        if declared not in (None, factor):
             raise InputError(
-                f"the map says '{variable.name}' is in '{named.name}', the FMU declares "
-                f"'{declared.name}'; leave the unit out, or give `scale` if the FMU is wrong"
+                f"the map says '{variable.name}' is in '{unit}', the FMU declares "
+                f"'{variable.unit}'; leave the unit out, or give `scale` if the FMU is wrong"
             )
-        return to_si(unit, wanted) if unit else 1.0
+        return factor
 
     def _constant(self, variable: Any, value: Value) -> Value:
         """``value`` in the variable's type; InputError if it is of another or out of range."""
