@@ -36,7 +36,7 @@ Mode = IntEnum(
     "INIT_FAILS INIT_HANGS INIT_ABORTS HUGE_VALUE CLOSE_ALL EARLY SAY WORST SCRIBBLE ORPHAN",
     start=0,
 )
-"""As in the C file."""
+"""What goes wrong; of these names the C file makes an enumeration."""
 
 
 @cache
@@ -54,7 +54,10 @@ def faulty_library(version: int) -> Path:
         for name in called
         if name not in there
     )
-    line = [*compiler.command, "-shared", "-fPIC", "-O1", f"-DFMI={version}", f"-I{HEADERS}"]
+    names = ",".join(name.upper() for name, *_ in _VARIABLES)
+    enums = f"-DREFERENCE_NAMES={names}", f"-DMODES={','.join(Mode.__members__)}"
+    flags = "-shared", "-fPIC", "-O1", f"-DFMI={version}", f"-I{HEADERS}", *enums
+    line = [*compiler.command, *flags]
 
     def make(folder: Path) -> None:
         text = folder / "faulty.c"

@@ -25,7 +25,6 @@ from bayesrace.plant.simulator import Simulator
 from bayesrace.vehicles import CarParameters
 from bayesrace.vehicles.models import STATES, dynamic
 from tests import sample_messages as messages
-from tests.car_fmu import packed_car
 from tests.conftest import SETTINGS, Circuit
 from tests.fmu_master import Slave
 
@@ -141,10 +140,6 @@ class Exported:
         with out.with_suffix(".lock").open("w") as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)
             return out if out.exists() else pack(self.define(version=version), out)
-
-    def plant(self, version: Literal[2, 3]) -> Path:
-        """The car's."""
-        return packed_car(version)
 
     def slave(
         self, fmu: Path, values: Mapping[str, float] | None = None, name: str = "one"

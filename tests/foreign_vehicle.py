@@ -49,9 +49,8 @@ class ForeignCar(Fmi2Slave):  # type: ignore[misc]
         for name in (*INPUTS, *PARAMETERS):
             setattr(self, name, 0.0)
         step = Discretisation(scheme="rk4", step_s=SUBSTEP_S, substeps=1)
-        self._state, self._input, self._next = np.zeros(7), np.zeros(2), np.zeros(7)
-        self._function = step.discretise(dynamic(get_car("orca")))  # the buffer needs it alive
-        self._advance = self._in_place(self._function)
+        self._state, self._input = np.zeros(7), np.zeros(2)
+        self._advance = step.discretise(dynamic(get_car("orca")))
         for name, text in INPUTS.items():
             self._register(name, text, Fmi2Causality.input)
         for name, text in PARAMETERS.items():
@@ -59,15 +58,6 @@ class ForeignCar(Fmi2Slave):  # type: ignore[misc]
         for name, text in OUTPUTS.items():
             read = partial(self._output, name)
             self._register(name, text, Fmi2Causality.output, getter=read)
-
-    def _in_place(self, function: Any) -> Any:
-        """The step on our own arrays, without a conversion."""
-        buffer, evaluate = function.buffer()
-        buffer.set_arg(0, self._state.data)
-        buffer.set_arg(1, self._input.data)
-        buffer.set_res(0, self._next.data)
-        self._buffer = buffer
-        return evaluate
 
     def _register(self, name: str, text: str, causality: Any, **options: Any) -> None:
         self.register_variable(Real(name, causality=causality, description=text, **options))
@@ -86,8 +76,7 @@ class ForeignCar(Fmi2Slave):  # type: ignore[misc]
         angle = -math.radians(self.SteerAngleCmd)
         self._input[:] = self.PedalPercent / 100.0, (angle - self._state[6]) / step_size
         for _ in range(round(step_size / SUBSTEP_S)):
-            self._advance()
-            self._state[:] = self._next
+            self._state = np.asarray(self._advance(self._state, self._input)).ravel()
         self._state[6] = angle
         return True
 

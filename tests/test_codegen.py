@@ -12,6 +12,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
+import bayesrace.cache as cache_module
 import bayesrace.codegen.build as build_module
 from bayesrace.cache import cache_folder
 from bayesrace.codegen.build import build, build_hash, generate
@@ -133,29 +134,22 @@ def test_the_hash_changes_with_compiler_flags_casadi_car_and_sources(
 ) -> None:
     compiler, settings = find_compiler(), BuildSettings()
     seen = {build_hash(settings, compiler)}
-
-    def another(identity: str) -> None:
-        assert identity not in seen
-        seen.add(identity)
-
-    another(build_hash(settings, Compiler(("othercc",), compiler.version)))
-    another(build_hash(settings, Compiler(compiler.command, "version 99")))
     source = next(build_module.NATIVE.glob("br_sqp.c"))
     read = Path.read_bytes
-    replacements = {
-        "FLAGS": ("-O0",),
-        "get_car": lambda _: car.model_copy(update={"mass_kg": 0.05}),
-    }
-    for name, value in replacements.items():
+    heavier = car.model_copy(update={"mass_kg": 0.05})
+    changes: tuple[tuple[object, str, object], ...] = (
+        (build_module, "FLAGS", ("-O0",)),
+        (build_module, "get_car", lambda _: heavier),
+        (cache_module, "version", lambda _: "9.9"),
+        (Path, "read_bytes", lambda p: read(p) + (b" " if p == source else b"")),
+    )
+    for where, name, value in changes:
         with monkeypatch.context() as patch:
-            patch.setattr(build_module, name, value)
-            another(build_hash(settings, compiler))
-    with monkeypatch.context() as patch:
-        patch.setattr("bayesrace.cache.version", lambda _: "9.9")
-        another(build_hash(settings, compiler))
-    with monkeypatch.context() as patch:
-        patch.setattr(Path, "read_bytes", lambda p: read(p) + (b" " if p == source else b""))
-        another(build_hash(settings, compiler))
+            patch.setattr(where, name, value)
+            seen.add(build_hash(settings, compiler))
+    seen.add(build_hash(settings, Compiler(("othercc",), compiler.version)))
+    seen.add(build_hash(settings, Compiler(compiler.command, "version 99")))
+    assert len(seen) == 1 + len(changes) + 2
     assert build_hash(settings, compiler) in seen
 
 
@@ -388,12 +382,17 @@ def test_concurrent_builds_of_the_same_hash_all_succeed(cache: Path) -> None:
     assert build(SMALL)[1] == read_manifest(folder)
 
 
-def test_the_library_exports_the_interface_only(kinematic_artefact: Path) -> None:
+def symbols(artefact: Path, which: str) -> set[str]:
+    """Names in the library that ``nm`` lists."""
     if not shutil.which("nm"):
         pytest.skip("nm (binutils) is not installed")
-    line = ["nm", "-D", "--defined-only", str(kinematic_artefact / LIBRARY)]
+    line = ["nm", "-D", which, str(artefact / LIBRARY)]
     listing = subprocess.run(line, capture_output=True, text=True, check=True).stdout
-    names = {row.split()[-1] for row in listing.splitlines()}
+    return {row.split()[-1].split("@")[0] for row in listing.splitlines()}
+
+
+def test_the_library_exports_the_interface_only(kinematic_artefact: Path) -> None:
+    names = symbols(kinematic_artefact, "--defined-only")
     assert {n for n in names if not n.startswith(("br_mpc_", "br_cycle_"))} == set()
     headers = ("bayesrace_mpc.h", "bayesrace_cycle.h")
     header = "".join((kinematic_artefact / one).read_text() for one in headers)
@@ -403,11 +402,7 @@ def test_the_library_exports_the_interface_only(kinematic_artefact: Path) -> Non
 
 def test_the_library_cannot_print_exit_or_start_threads(kinematic_artefact: Path) -> None:
     """It is not linked with functions for that; that it never allocates is counted in C."""
-    if not shutil.which("nm"):
-        pytest.skip("nm (binutils) is not installed")
-    line = ["nm", "-D", "--undefined-only", str(kinematic_artefact / LIBRARY)]
-    listing = subprocess.run(line, capture_output=True, text=True, check=True).stdout
-    names = {row.split()[-1].split("@")[0] for row in listing.splitlines()}
+    names = symbols(kinematic_artefact, "--undefined-only")
     unwanted = ("printf", "puts", "putchar", "fwrite", "exit", "abort", "pthread", "mutex", "Py")
     assert not [name for name in names if any(word in name for word in unwanted)]
 

@@ -10,6 +10,7 @@ from bayesrace.controller.driver import DOUBTED, UNPREDICTABLE, Level
 from bayesrace.controller.native_step import StepStatus
 from bayesrace.vehicles import get_car
 from bayesrace.vehicles.models import STATES
+from tests.car_fmu import packed_car
 from tests.fmu_lockstep import (  # noqa: F401 - a fixture is used by name
     RACING,
     STEP_S,
@@ -40,7 +41,7 @@ def test_a_plain_master_drives_the_lockstep_run(exported: Exported, version: Lit
     same(answers(controller, run.x), run)
     controller.reset()
     controller.initialise()
-    car = exported.slave(exported.plant(version), dict(zip(STATES, start, strict=True)))
+    car = exported.slave(packed_car(version), dict(zip(STATES, start, strict=True)))
     states, inputs = drive(car, controller, STEPS)
     np.testing.assert_allclose(states, run.x, rtol=0, atol=1e-9)
     np.testing.assert_allclose(inputs, run.u, rtol=0, atol=1e-7)
@@ -57,21 +58,9 @@ def test_a_master_that_steps_side_by_side_is_compensated_for(exported: Exported)
     assert max(level for _, level in run.said) == Level.SOLUTION
     controller.reset()
     controller.initialise({"delay": STEP_S})
-    car = exported.slave(exported.plant(3), dict(zip(STATES, start, strict=True)))
+    car = exported.slave(packed_car(3), dict(zip(STATES, start, strict=True)))
     states, _ = drive(car, controller, STEPS, parallel=True)
     np.testing.assert_allclose(states, run.x, rtol=0, atol=1e-7)
-
-
-@pytest.mark.parametrize("turned_rad", [-1.1, 1.1])
-def test_a_car_that_stands_and_points_away_finds_its_way_as_in_lockstep(
-    exported: Exported, turned_rad: float
-) -> None:
-    start = exported.circuit.start(1.0, 0.0)
-    start[2] += turned_rad
-    start[6] = 0.35 * np.sign(turned_rad)
-    run = exported.lockstep().run(start, 150)
-    assert run.x[-1][3] > 0.5
-    same(answers(exported.slave(exported.fmu(2)), run.x), run)
 
 
 @pytest.mark.parametrize("turned_rad", [0.0, 2.0])
@@ -183,7 +172,7 @@ def test_it_is_as_cautious_as_in_lockstep(exported: Exported, connected: bool) -
 def test_a_speed_limit_slows_down_along_the_line_to_standstill(exported: Exported) -> None:
     start = exported.circuit.start(v_mps=1.5)
     controller = exported.slave(exported.fmu(3))
-    car = exported.slave(exported.plant(3), dict(zip(STATES, start, strict=True)))
+    car = exported.slave(packed_car(3), dict(zip(STATES, start, strict=True)))
     drive(car, controller, 50)
     controller.set({"speed_limit": 0.8})
     states, _ = drive(car, controller, 100)

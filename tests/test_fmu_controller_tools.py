@@ -20,6 +20,7 @@ from bayesrace.codegen.fmu.build import sources_of, write_sources
 from bayesrace.codegen.host_files import WEIGHTS_FILE, path_file
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import zero_weights
+from tests.car_fmu import packed_car
 from tests.conftest import fit_weights
 from tests.fmu_lockstep import (  # noqa: F401 - a fixture is used by name
     Exported,
@@ -210,7 +211,7 @@ def test_weights_are_exchanged_without_compiling(exported: Exported, tmp_path: P
     with pytest.raises(InputError, match="learned for"):
         exchange_weights(out, zero_weights("orca", "another"), out)
     with pytest.raises(InputError, match="not a controller's FMU"):
-        exchange_weights(exported.plant(3), other, out)
+        exchange_weights(packed_car(3), other, out)
     with pytest.raises(InputError, match="cannot be read"):
         exchange_weights(tmp_path / "none.fmu", other, out)
 

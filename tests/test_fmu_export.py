@@ -1,4 +1,7 @@
-"""The car as a Co-Simulation FMU is the built-in plant: trajectory, guard, parameters."""
+"""The car as a Co-Simulation FMU is the built-in plant: trajectory, guard, parameters.
+
+Every exported FMU names the parts of other authors in it, with their licences.
+"""
 
 import re
 import zipfile
@@ -16,12 +19,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bayesrace.codegen.fmu import Variable, car_fmu, pack
+from bayesrace.codegen.fmu.archive import licence_files, third_parties
+from bayesrace.codegen.fmu.build import get_platform
 from bayesrace.errors import InputError
 from bayesrace.plant.vehicle import PlantGuard
 from bayesrace.vehicles import CarParameters, get_car
 from bayesrace.vehicles.models import STATES
 from tests.car_fmu import Kind, Version, built_in, commands, driven, packed_car, slave, unpacked_car
 from tests.cars import with_numbers
+from tests.fmu_lockstep import Exported, exported_controllers  # noqa: F401 - a fixture
 from tests.fmu_master import Slave
 
 etree: Any = pytest.importorskip("lxml.etree")
@@ -113,17 +119,6 @@ def test_an_odd_communication_step_is_divided_into_parts_of_at_most_a_millisecon
     other.step(0.005)
     np.testing.assert_allclose(one.get(*STATES), other.get(*STATES), rtol=0, atol=1e-6)
     assert one.get("time") == [pytest.approx(0.0123)]
-
-
-def test_a_standing_car_stays_when_its_command_is_lost() -> None:
-    one = slave()
-    one.initialise({"vx": 0.3, "psi": 0.7})
-    rows = driven(one, [(np.nan, 0.0)] * 400)
-    one.close()
-    assert rows[0, 7] == -0.1
-    assert (rows[1:, 3] <= rows[:-1, 3]).all()
-    assert 0 <= rows[-1, 3] < 1e-3
-    assert rows[-1, 7] == pytest.approx(-0.1 * rows[-2, 3] / get_car("orca").brake_fade_mps)
 
 
 @pytest.fixture(scope="module")
@@ -253,3 +248,58 @@ def test_a_definition_that_cannot_work_is_refused(car: CarParameters, tmp_path: 
     strange = replace(definition, variables=(Variable("a", "local", "", unit="furlong"),))
     with pytest.raises(InputError, match="furlong"):
         pack(strange, tmp_path / "x.fmu")
+
+
+NOTICES = (Path(__file__).parents[1] / "THIRD_PARTY_NOTICES.md").read_text()
+
+FMI = ("FMI headers", "BSD-2-Clause", "Modelica Association Project")
+CASADI = ("CasADi runtime", "MIT-0", "Joel Andersson, Joris Gillis, Moritz Diehl")
+DAQP = ("DAQP", "MIT", "Daniel Arnström")
+ZIG = ("Zig compiler runtime", "MIT", "Zig contributors")
+MINGW = ("MinGW-w64 runtime", "ZPL-2.1", "the mingw-w64 project")
+
+
+def named(read: dict[str, str], *parts: tuple[str, str, str]) -> None:
+    """Page, licence file and repository name these parts, and there is a text of each."""
+    folder = "documentation/licenses/"
+    entry, page = read[f"{folder}license.txt"], read["documentation/index.html"]
+    assert "BayesRace contributors" in entry
+    for name, licence, holder in parts:
+        line = f"{name} ("
+        assert line in entry
+        assert line in page
+        assert f"), {licence}" in entry[entry.index(line) :]
+        assert holder in read[f"{folder}{name.replace(' ', '-')}.txt"]
+        assert f"| {name} |" in NOTICES
+        assert holder in NOTICES
+    assert sum(path.startswith(folder) for path in read) == len(parts) + 1
+
+
+def documentation(fmu: Path) -> dict[str, str]:
+    with zipfile.ZipFile(fmu) as archive:
+        names = [name for name in archive.namelist() if name.startswith("documentation/")]
+        return {name: archive.read(name).decode() for name in names}
+
+
+@pytest.mark.parametrize(("version", "kind"), ALL)
+def test_the_car_names_fmi_and_casadi(version: Version, kind: Kind) -> None:
+    fmu = packed_car(version, kind)
+    named(documentation(fmu), FMI, CASADI)
+    with zipfile.ZipFile(fmu) as archive:  # nothing else is by others
+        sources = {name for name in archive.namelist() if name.startswith("sources/")}
+        assert all(
+            b"Copyright" not in archive.read(name) or name.startswith(f"sources/fmi{version}")
+            for name in sources
+        )
+
+
+@pytest.mark.parametrize("version", [2, 3])
+def test_the_controller_names_daqp_as_well(exported: Exported, version: Version) -> None:
+    named(documentation(exported.fmu(version)), FMI, CASADI, DAQP)
+
+
+def test_cross_compiled_binaries_name_what_ziglang_links(ziglang: None) -> None:
+    windows = get_platform("x86_64-windows")
+    parts = third_parties(car_fmu(get_car("orca")), [windows])
+    files = {name: content.decode() for name, content in licence_files(parts).items()}
+    named(files | {"documentation/index.html": "".join(map(str, parts))}, FMI, CASADI, ZIG, MINGW)

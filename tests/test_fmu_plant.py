@@ -43,13 +43,11 @@ HANGS_S = 2.0
 
 FAULTS = {
     Mode.ABORT: r"crashed \(SIGABRT\); its last message: the engine is on fire",
-    Mode.EXIT: "exit code 3",
     Mode.HANG: "did not answer within 2 s",
     Mode.NOT_A_NUMBER: "gave vx = nan",
-    Mode.FAIL: r"failed \(error\); its last message: a wheel came off",
     Mode.TERMINATE: "the FMU ended the simulation",
-    Mode.HUGE_VALUE: r"vx = 1e\+09",
 }
+"""``test_fmu_host`` has the others."""
 
 
 def write_map(path: Path, timeout_s: float) -> Path:
@@ -94,15 +92,9 @@ def with_fault(mode: Mode) -> dict[str, Any]:
     [
         (Mode.ABORT, True),
         (Mode.HANG, False),
-        *(
-            pytest.param(mode, True, marks=pytest.mark.check)
-            for mode in FAULTS
-            if mode is not Mode.ABORT
-        ),
-        *(
-            pytest.param(mode, False, marks=pytest.mark.check)
-            for mode in (Mode.ABORT, Mode.NOT_A_NUMBER)
-        ),
+        pytest.param(Mode.NOT_A_NUMBER, True, marks=pytest.mark.check),
+        pytest.param(Mode.TERMINATE, True, marks=pytest.mark.check),
+        pytest.param(Mode.NOT_A_NUMBER, False, marks=pytest.mark.check),
     ],
 )
 def test_a_fault_ends_the_run_and_nothing_else(

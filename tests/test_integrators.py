@@ -46,13 +46,6 @@ def test_the_order_measured_by_halving_is_the_order_claimed(
     assert measured == pytest.approx(order, abs=0.25), errors
 
 
-@pytest.mark.parametrize("name", ["dynamic", "e_kinematic"])
-def test_many_substeps_reach_the_solution_of_scipy(car: CarParameters, name: str) -> None:
-    model = MODELS[name](car)
-    ours = one(Discretisation(scheme="rk4", step_s=0.02, substeps=200), model)
-    np.testing.assert_allclose(ours, exact(model, X, U, 0.02), rtol=1e-10, atol=1e-10)
-
-
 @pytest.mark.parametrize("scheme", sorted(SCHEMES))
 def test_substeps_are_the_same_as_shorter_steps(car: CarParameters, scheme: str) -> None:
     model = dynamic(car)

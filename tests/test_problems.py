@@ -6,6 +6,7 @@ over four features. Nothing in controller/native is written for it.
 """
 
 import struct
+from dataclasses import replace
 
 import casadi as ca
 import numpy as np
@@ -267,8 +268,6 @@ def test_parameters_outside_their_limits_and_unknown_ones_are_refused(
 
 
 def test_a_description_that_c_could_not_follow_is_refused(problem: Problem) -> None:
-    from dataclasses import replace
-
     s = problem.symbols
     with pytest.raises(ValueError, match="the cost couples states with inputs"):
         replace(problem, cost=problem.cost + s.x[0] * s.u[0])
@@ -290,8 +289,6 @@ def test_second_derivatives_that_depend_on_the_stage_are_those_of_the_step(
     problem: Problem,
 ) -> None:
     """A cost whose curvature only the step knows: the preparation must not use an older one."""
-    from dataclasses import replace
-
     s = problem.symbols
     change = s.u[2] - s.u_before[2]
     error = (s.x[0] - s.p[0]) ** 2

@@ -33,54 +33,8 @@ typedef fmi2Status Status;
 
 enum { OK, WARNING, DISCARD, ERROR, FATAL };
 
-enum { /* value references */
-       D,
-       DELTA_RATE,
-       X,
-       Y,
-       PSI,
-       VX,
-       VY,
-       OMEGA,
-       DELTA,
-       AT_S,
-       MODE,
-       GEAR,
-       LIGHT,
-       GEAR_READ,
-       LIGHT_READ,
-       LABEL,
-       LABEL_LENGTH,
-       INSTANCES,
-       SOFT,
-       SMALL,
-       VALUES
-};
-
-enum { /* modes; the numbers are those in tests/faulty_fmu.py */
-       GOOD,
-       ABORT,
-       SEGFAULT,
-       EXIT,
-       HANG,
-       NOT_A_NUMBER,
-       FAIL,
-       REFUSE,
-       FLOOD_LOG,
-       FLOOD_STDOUT,
-       SLOW,
-       TERMINATE,
-       INIT_FAILS,
-       INIT_HANGS,
-       INIT_ABORTS,
-       HUGE_VALUE,
-       CLOSE_ALL,
-       EARLY,
-       SAY,
-       WORST,
-       SCRIBBLE,
-       ORPHAN
-};
+enum { REFERENCE_NAMES, VALUES }; /* both from tests/faulty_fmu.py */
+enum { MODES };
 
 typedef struct {
     double value[VALUES];
