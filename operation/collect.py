@@ -19,7 +19,7 @@ from bayesrace.operation.closed_loop import ClosedLoop, Driven, built_in_car
 from bayesrace.plant.settings import SensorNoise
 from bayesrace.plant.vehicle import FmuFault, Vehicle
 from bayesrace.raceline import RaceLine, RaceLineSettings
-from bayesrace.raceline.nodes import timed_line
+from bayesrace.raceline.friction import timed_line
 from bayesrace.tracks import Track
 from bayesrace.tracks.spline import fit_arc_length
 from bayesrace.vehicles import CarParameters, car_text

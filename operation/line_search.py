@@ -15,8 +15,8 @@ from bayesrace.operation.preparation import prepare
 from bayesrace.operation.settings import BayesianSettings, PreparationSettings
 from bayesrace.operation.terminal.terminal import Stages
 from bayesrace.raceline import RaceLine, RaceLineSettings, racing_line
+from bayesrace.raceline.friction import NodeLines, roughness
 from bayesrace.raceline.line import line_identity
-from bayesrace.raceline.nodes import NodeLines, roughness
 from bayesrace.tracks import Track, load_track
 from bayesrace.vehicles import CarParameters
 

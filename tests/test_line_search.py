@@ -15,8 +15,7 @@ from bayesrace.errors import InputError
 from bayesrace.learning.search import log_improvement, search
 from bayesrace.operation.line_search import driven_lap
 from bayesrace.raceline import RaceLineSettings, read_raceline_for
-from bayesrace.raceline.friction import speed_profile
-from bayesrace.raceline.nodes import NodeLines, roughness
+from bayesrace.raceline.friction import NodeLines, roughness, speed_profile
 from bayesrace.tracks import StartLine, load_track
 from bayesrace.vehicles import get_car
 from tests.command_line import Cli, refused

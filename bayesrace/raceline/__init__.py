@@ -1,8 +1,8 @@
 """Racing lines: minimum-time optimisation, the line as data, its file form, and the cache.
 
-Order: the line (line.py), gates across the track (gates.py), the friction circle (friction.py), the
-nonlinear programme over both (ocp.py, solved as nlp.py has it), and lines through a few nodes, for
-optimisers without derivatives (nodes.py).
+Order: the line (line.py), gates across the track (gates.py), the friction circle, and lines through
+a few nodes for optimisers without derivatives (friction.py), the nonlinear programme over gates and
+circle (ocp.py, solved as nlp.py has it).
 
 CasADi is imported on the first call of :func:`compute_raceline`, not with this package.
 """

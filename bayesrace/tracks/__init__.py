@@ -1,6 +1,5 @@
 """Tracks: centrelines with widths, projection on them, files, built-in and random circuits."""
 
-from bayesrace.tracks.generator import random_track
 from bayesrace.tracks.library import (
     DEFAULT_RACE_TRACK,
     DEFAULT_TRAINING_TRACK,
@@ -8,6 +7,7 @@ from bayesrace.tracks.library import (
     is_random_track,
     load_any,
     load_track,
+    random_track,
     read_recentred,
     read_smoothed,
     read_track,

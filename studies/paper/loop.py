@@ -19,7 +19,7 @@ from bayesrace.operation.report.panels import input_figures
 from bayesrace.operation.report.style import MUTED, WARNING, look, panel
 from bayesrace.plant.simulator import PLANT
 from bayesrace.raceline import RaceLine, RaceLineSettings
-from bayesrace.raceline.nodes import timed_line
+from bayesrace.raceline.friction import timed_line
 from bayesrace.studies.paper.experiment import (
     ELSEWHERE,
     Experiment,
