@@ -62,7 +62,9 @@ def test_the_built_in_car_is_the_one_it_was() -> None:
 
 def test_a_car_survives_its_file_and_its_description(tmp_path: Path) -> None:
     stated = {"mass_kg": 1 / 3, "tuning": {"pursuit": {"lookahead_m": 0.1 + 0.2}}}
-    car = described_car(default_car().model_dump() | stated | {"name": "mine"})
+    car = described_car(
+        default_car().model_dump() | stated | {"name": "mine", "race_track": '"🏁"'}
+    )
     write_car(tmp_path / "mine.toml", car)
     again = read_car(tmp_path / "mine.toml")
     assert again == car == described_car(car_text(car))

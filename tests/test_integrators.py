@@ -131,7 +131,9 @@ def test_identity_changes_with_the_discretisation(
     assert PREDICTION.identity("dynamic", car) != ours
 
 
-@pytest.mark.parametrize("field", ["lf_m", "lr_m", "mass_kg", "inertia_kgm2", "cm1", "cm2", "cr0"])
+@pytest.mark.parametrize(
+    "field", ["lf_m", "lr_m", "mass_kg", "inertia_kgm2", "cm1", "cm2", "cr0", "front_b"]
+)
 def test_identity_changes_with_the_car(car: CarParameters, field: str) -> None:
     changed = with_numbers(car, {field: 1.01 * car.equation_numbers[field]})
     assert PREDICTION.identity("dynamic", changed) != PREDICTION.identity("dynamic", car)
@@ -140,6 +142,7 @@ def test_identity_changes_with_the_car(car: CarParameters, field: str) -> None:
 @pytest.mark.parametrize("field", ["friction", "width_m", "length_m"])
 def test_identity_ignores_friction_and_outline(car: CarParameters, field: str) -> None:
     changed = car.model_copy(update={field: 1.5 * getattr(car, field)})
+    assert changed.model_copy(update={"name": "x"}).digest() == car.digest()
     assert PREDICTION.identity("dynamic", changed) == PREDICTION.identity("dynamic", car)
 
 

@@ -17,7 +17,6 @@ from bayesrace.vehicles.models import (
     e_kinematic,
     kinematic,
 )
-from tests.cars import with_numbers
 from tests.conftest import TRUTH
 
 MIRROR = np.array([1.0, -1, -1, 1, -1, -1, -1])
@@ -210,12 +209,3 @@ def test_e_kinematic_equals_kinematic_in_a_gentle_turn(car: CarParameters, delta
 def test_unknown_car_is_an_input_error_that_names_the_known_ones() -> None:
     with pytest.raises(InputError, match=r"unknown car 'kart'.*orca"):
         get_car("kart")
-
-
-def test_the_digest_sees_what_shapes_the_models_only(car: CarParameters) -> None:
-    same = car.model_copy(update={"name": "x", "friction": 0.5, "width_m": 0.1, "length_m": 0.2})
-    assert same.digest() == car.digest()
-    heavier = car.model_copy(update={"mass_kg": 0.042})
-    assert heavier.digest() != car.digest()
-    stiffer = with_numbers(car, {"front_b": 2.6})
-    assert stiffer.digest() != car.digest()

@@ -356,5 +356,5 @@ def _line(model: BaseModel, name: str) -> str:
         text = ", ".join(f"{key} = {number!r}" for key, number in value)
         text = f"{{ {text} }}"
     else:
-        text = json.dumps(value)
+        text = json.dumps(value, ensure_ascii=False)
     return f"{name} = {text}" + (f"  # {about}" if about else "")
