@@ -87,12 +87,8 @@ class RacelineTuning(_Section):
     step_m: float = _number(0.03, "length of an optimisation interval [m]")
     spacing_m: float = _number(0.01, "distance of the line's points [m]")
     smoothing_m: float = _number(0.03, "Gaussian smoothing of the frame, not of the track [m]")
-    rate_weight: float = _number(
-        1e-6, "cost of the squared slope of acceleration over the way, against chatter [s^5/m]"
-    )
-    curvature_weight: float = _number(
-        1e-6, "cost of the squared slope of curvature over the way [s m^3]"
-    )
+    rate_weight: float = _number(1e-6, "cost of acceleration's squared slope over the way [s^5/m]")
+    curvature_weight: float = _number(1e-6, "cost of curvature's squared slope [s m^3]")
     tolerance_m: float = _number(5e-4, "by which the line may pass the margin between stations [m]")
     room_m: float = _number(0.005, "least width that the margins must leave [m]")
     speed_min_mps: float = _number(0.2, "least speed of a flying lap [m/s]")
@@ -103,13 +99,9 @@ class RacelineTuning(_Section):
 class PathTuning(_Section):
     """The table of racing line and track that the planner reads, and its search."""
 
-    spacing_m: float = _number(
-        0.005, "wanted distance of rows; the planner interpolates linearly [m]"
-    )
+    spacing_m: float = _number(0.005, "distance of rows; the planner interpolates linearly [m]")
     spacing_min_m: float = _number(1e-4, "least distance of rows [m]")
-    spacing_max_m: float = _number(
-        0.1, "largest distance of rows: the search window must hold several [m]"
-    )
+    spacing_max_m: float = _number(0.1, "largest distance; the window must hold several rows [m]")
     window_back_m: float = _number(0.3, "search window behind the last projection [m]")
     window_ahead_m: float = _number(0.5, "search window ahead of it [m]")
     far_m: float = _number(1e4, "largest coordinate of a row [m]")
@@ -123,9 +115,7 @@ class TurnTuning(_Section):
     away_rad: float = _number(1.0, "and if the line is farther than this to one side [rad]")
     faced_rad: float = _number(0.3, "a turn ends within this angle [rad]")
     ahead_m: float = _number(0.5, "point of the line that the car turns to, ahead [m]")
-    tangent_m: float = _number(
-        0.05, "length of line that its direction beside the car is taken from [m]"
-    )
+    tangent_m: float = _number(0.05, "length of line that gives its direction at the car [m]")
     behind_rad: float = _number(2.0, "with the point farther behind, either side serves [rad]")
     wider_m: float = _number(2.0, "added to the track on either side, on the way [m]")
     pace_mps: float = _number(0.5, "speed of a turn [m/s]")
@@ -140,18 +130,11 @@ class BrakingTuning(_Section):
     lookahead_m: float = _number(0.16, "distance of the target at standstill [m]")
     lookahead_s: float = _number(0.05, "distance added per speed [s]")
     preview_s: float = _number(0.04, "how far ahead the line's curvature is taken [s]")
-    understeer_s2pm: float = _number(
-        0.008, "steering angle added per acceleration in a bend [rad s^2/m]"
-    )
+    understeer_s2pm: float = _number(0.008, "steering angle per lateral acceleration [rad s^2/m]")
     damping_s: float = _number(0.02, "steering angle per excess of the yaw rate [s]")
     slow_mps: float = _number(0.4, "slower, slip angles are those at this speed [m/s]")
     chord_m: float = _number(0.08, "chord that the line's direction is taken from [m]")
-    centre: float = _number(
-        0.5,
-        "share of the way from the line to the middle of the track, at standstill [-]",
-        ge=0,
-        le=1,
-    )
+    centre: float = _number(0.5, "share of the way to mid-track, at standstill [-]", ge=0, le=1)
 
 
 class MonitorTuning(_Section):
@@ -161,16 +144,10 @@ class MonitorTuning(_Section):
     3.6 rad/s from one state to the next (1 mm, 0.5 degrees, 0.05 m/s, 0.2 rad/s; slides included).
     """
 
-    position_m: float = _number(
-        0.022, "between the position and the way that the velocities make [m]"
-    )
-    heading_rad: float = _number(
-        0.12, "between the heading and the angle that the yaw rate makes [rad]"
-    )
-    steering_rad: float = _number(
-        0.012, "between the steering angle and what the steering rate makes of it [rad]"
-    )
-    memory_s: float = _number(0.2, "over which these ways are reckoned [s]")
+    position_m: float = _number(0.022, "between position and integrated velocities [m]")
+    heading_rad: float = _number(0.12, "between heading and integrated yaw rate [rad]")
+    steering_rad: float = _number(0.012, "between steering angle and integrated rate [rad]")
+    memory_s: float = _number(0.2, "time over which they are integrated [s]")
     speed_mps: float = _number(0.5, "change of the velocity without acceleration [m/s]")
     acceleration_mps2: float = _number(12.0, "largest acceleration [m/s^2]")
     yaw_rate_radps: float = _number(2.5, "change of the yaw rate at once [rad/s]")
@@ -235,20 +212,14 @@ class ProgressTuning(_Section):
     gain: float = _number(2.5, "reward of the time that the line takes for the progress [1/s]")
     r_duty: float = _number(2e-4, "R: squared change of the drive command [1/command^2]")
     r_delta_rate: float = _number(1e-6, "R: squared steering rate [s^2/rad^2]")
-    proximal_duty: float = _number(
-        0.02, "of a drive command's change in one QP [1/command^2]", ge=0
-    )
-    proximal_delta_rate: float = _number(
-        1e-3, "of a steering rate's change in one QP [s^2/rad^2]", ge=0
-    )
+    proximal_duty: float = _number(0.02, "of the command's change in a QP [1/command^2]", ge=0)
+    proximal_delta_rate: float = _number(1e-3, "of the rate's change in a QP [s^2/rad^2]", ge=0)
     s_slack: float = _number(1000.0, "S: squared track violation [1/m^2]")
     margin_m: float = _number(0.01, "distance kept from the track edges [m]")
     horizon: int = _number(40, "stages that the OCP looks ahead [-]", ge=2, le=100)
-    free_stages: int = _number(
-        10, "first stages whose inputs each change by themselves in one QP [-]", ge=1, le=100
-    )
+    free_stages: int = _number(10, "first stages: each changes by itself [-]", ge=1, le=100)
     block_stages: int = _number(
-        5, "of the stages after them, so many change alike; 1: no blocks [-]", ge=1, le=100
+        5, "so many later ones change alike; 1: no blocks [-]", ge=1, le=100
     )
 
     @property
@@ -270,12 +241,7 @@ class CautionTuning(_Section):
     steering_rad: float = _number(1.0, "deviation of the steering angle [rad]")
     command: float = _number(1.0, "effort of the drive command [command]")
     steering_rate_radps: float = _number(3.0, "effort of the steering rate [rad/s]")
-    share: float = _number(
-        0.5,
-        "of half the track's width that uncertainty may take before the car slows down [-]",
-        gt=0,
-        le=1,
-    )
+    share: float = _number(0.5, "of half the width: more uncertainty slows the car [-]", gt=0, le=1)
     slower_ps: float = _number(2.5, "speed of the reference then falls at this rate [1/s]")
     faster_ps: float = _number(0.5, "and rises again at this one [1/s]")
     least: float = _number(0.5, "share of the line's speed that is never undercut [-]", gt=0, le=1)
@@ -293,21 +259,15 @@ class PursuitTuning(_Section):
     lookahead_m: float = _number(0.16, "distance of the target at standstill [m]")
     lookahead_s: float = _number(0.05, "distance added per speed [s]")
     speed_gain_spm: float = _number(1.8, "drive command per speed error [command s/m]")
-    excite_d: float = _number(
-        0.1, "standard deviation of the disturbance of the drive command [command]"
-    )
+    excite_d: float = _number(0.1, "standard deviation of the command's disturbance [command]")
     sway_s: float = _number(3.7, "period in which the target speed rises and falls [s]")
-    faster: float = _number(
-        0.15, "share of its mean by which the target speed rises [-]", ge=0, lt=1
-    )
+    faster: float = _number(0.15, "share by which the target speed rises [-]", ge=0, lt=1)
     slower: float = _number(0.15, "share by which it falls [-]", ge=0, lt=1)
     speed_min_mps: float = _number(0.4, "target speed is never below [m/s]")
     keep_m: float = _number(0.12, "distance of the driven line from the track's edges [m]")
     preview_s: float = _number(0.12, "how far ahead the line's speed is taken [s]")
     steering_s: float = _number(0.04, "how far ahead the line's curvature is taken [s]")
-    understeer_s2pm: float = _number(
-        0.008, "steering angle added per acceleration in a bend [rad s^2/m]"
-    )
+    understeer_s2pm: float = _number(0.008, "steering angle per lateral acceleration [rad s^2/m]")
     damping_s: float = _number(0.01, "steering angle per excess of the yaw rate [s]")
     window_m: float = _number(0.4, "way ahead in which the nearest point is sought [m]")
     lost_m: float = _number(0.5, "farther from it, the whole line is searched [m]")
@@ -317,28 +277,14 @@ class PursuitTuning(_Section):
 class GateTuning(_Section):
     """What new weights are judged by, and which samples are learned from."""
 
-    resolution_vx_mps2: float = _number(
-        0.1, "error in the longitudinal acceleration that does not count [m/s^2]"
-    )
-    resolution_vy_mps2: float = _number(
-        0.2, "error in the lateral acceleration that does not count [m/s^2]"
-    )
-    resolution_omega_radps2: float = _number(
-        2.0, "error in the yaw acceleration that does not count [rad/s^2]"
-    )
-    absurd_vx_mps2: float = _number(
-        100.0, "longitudinal acceleration that no correction amounts to [m/s^2]"
-    )
-    absurd_vy_mps2: float = _number(
-        100.0, "lateral acceleration that no correction amounts to [m/s^2]"
-    )
-    absurd_omega_radps2: float = _number(
-        1000.0, "yaw acceleration that no correction amounts to [rad/s^2]"
-    )
+    resolution_vx_mps2: float = _number(0.1, "longitudinal error that does not count [m/s^2]")
+    resolution_vy_mps2: float = _number(0.2, "lateral error that does not count [m/s^2]")
+    resolution_omega_radps2: float = _number(2.0, "yaw error that does not count [rad/s^2]")
+    absurd_vx_mps2: float = _number(100.0, "largest longitudinal correction [m/s^2]")
+    absurd_vy_mps2: float = _number(100.0, "largest lateral correction [m/s^2]")
+    absurd_omega_radps2: float = _number(1000.0, "largest yaw correction [rad/s^2]")
     moving_mps: float = _number(0.05, "slower, a car stands, and its samples are left out [m/s]")
-    spin_rad: float = _number(
-        0.8, "slip angle of the body beyond which a car spins, and its samples are left out [rad]"
-    )
+    spin_rad: float = _number(0.8, "beyond this slip angle a car spins: samples left out [rad]")
 
     @property
     def resolution(self) -> tuple[float, float, float]:
