@@ -21,7 +21,7 @@ from bayesrace.studies.paper import models as learning
 from bayesrace.studies.paper.experiment import Experiment, Finding, at_most
 from bayesrace.studies.paper.loop import line_section, published_line, tenth_section
 from bayesrace.studies.paper.models import gains, kernel_section, model_section, smoothness
-from bayesrace.studies.paper.settings import DRIVES, PaperSettings
+from bayesrace.studies.settings import DRIVES, PaperSettings
 from bayesrace.vehicles import CarParameters, builtin_cars, get_car, parameters
 from bayesrace.vehicles.models import dynamic
 from bayesrace.vehicles.tuning import PursuitTuning

@@ -15,8 +15,7 @@ if TYPE_CHECKING:
     from bayesrace.operation.analysis.race import RaceAnalysis
     from bayesrace.operation.settings import RaceSettings
     from bayesrace.studies.latency.settings import LatencySettings
-    from bayesrace.studies.paper.settings import PaperSettings
-    from bayesrace.studies.settings import BenchSettings, TuneSettings
+    from bayesrace.studies.settings import BenchSettings, PaperSettings, TuneSettings
     from bayesrace.transport import Endpoints
 
 __all__ = [
@@ -196,7 +195,7 @@ def latency(
         raise run.error
 
 
-@options_of("bayesrace.studies.paper.settings.PaperSettings", "tracks data raceline quick seed")
+@options_of("bayesrace.studies.settings.PaperSettings", "tracks data raceline quick seed")
 def paper(
     settings: "Given[PaperSettings]",
     out: Path = options.out_folder("Folder for page and figures.", default=Path("runs/paper")),

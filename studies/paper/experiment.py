@@ -30,7 +30,44 @@ from bayesrace.operation.terminal.terminal import Stages
 from bayesrace.raceline import RaceLine
 from bayesrace.studies.campaign.case import software_identity
 
-__all__ = ["ELSEWHERE", "Experiment", "Figures", "Finding", "Section", "at_most", "stored"]
+__all__ = [
+    "ELSEWHERE", "GP", "LAPS_OFF", "LAPS_ON", "SOURCE", "Experiment", "Figures", "Finding",
+    "Section", "at_most", "stored",
+]  # fmt: skip
+
+# Published: its code run again on its ETHZ track (standing start at 0.1 m/s, 50 Hz, horizon 20),
+# and its data evaluated again.
+
+SOURCE: Final = (
+    "A. Jain, M. O'Kelly, P. Chaudhari, M. Morari: BayesRace: Learning to race autonomously using "
+    "prior experience. Conference on Robot Learning, 2020"
+)
+
+
+class _Lap(NamedTuple):
+    """From standstill on ETHZ; None where no lap was finished."""
+
+    time_s: float | None
+    off_samples: int | None
+
+
+LAPS_ON: Final = {  # track constraints on
+    "worstcase": _Lap(None, None),
+    "bayesrace": _Lap(7.988, 9),
+    "bayesrace-updated": _Lap(7.932, 11),
+    "bestcase": _Lap(7.797, 12),
+}
+LAPS_OFF: Final = {  # … and off
+    "worstcase": _Lap(8.694, 24),
+    "bayesrace": _Lap(7.792, 17),
+    "bayesrace-updated": _Lap(7.692, 17),
+    "bestcase": _Lap(7.681, 14),
+}
+GP: Final = {  # RMSE without the GP, RMSE and R² before, RMSE and R² after the update
+    "vx": (0.0570, 0.00555, 0.932, 0.00065, 0.999),
+    "vy": (0.0519, 0.0219, 0.820, 0.00039, 0.9999),
+    "omega": (0.384, 0.176, 0.790, 0.142, 0.864),
+}
 
 _COLUMNS: Final = {**RUN_COLUMNS, TELEMETRY: f"{RUN_COLUMNS[TELEMETRY]} plan_x plan_u"}
 

@@ -22,13 +22,14 @@ from bayesrace.raceline import RaceLine, RaceLineSettings
 from bayesrace.raceline.friction import timed_line
 from bayesrace.studies.paper.experiment import (
     ELSEWHERE,
+    LAPS_OFF,
+    LAPS_ON,
     Experiment,
     Figures,
     Finding,
     Section,
     at_most,
 )
-from bayesrace.studies.paper.published import LAPS_OFF, LAPS_ON
 from bayesrace.tracks import Track
 from bayesrace.tracks.spline import fit_arc_length
 from bayesrace.tracks.tables import read_table

@@ -17,7 +17,7 @@ from bayesrace.operation.settings import PreparationSettings
 from bayesrace.operation.terminal.terminal import Stages
 from bayesrace.raceline import write_raceline
 from bayesrace.studies.bench import BenchResult, run_bench
-from bayesrace.studies.paper.experiment import Experiment, Finding, Section, stored
+from bayesrace.studies.paper.experiment import SOURCE, Experiment, Finding, Section, stored
 from bayesrace.studies.paper.loop import line_section, loop_sections, published_line, tenth_section
 from bayesrace.studies.paper.models import (
     Learned,
@@ -27,9 +27,7 @@ from bayesrace.studies.paper.models import (
     model_section,
     smoothness,
 )
-from bayesrace.studies.paper.published import SOURCE
-from bayesrace.studies.paper.settings import LINE, PaperSettings
-from bayesrace.studies.settings import BenchSettings
+from bayesrace.studies.settings import LINE, BenchSettings, PaperSettings
 
 __all__ = ["make_paper"]
 

@@ -28,9 +28,8 @@ from bayesrace.operation.report.gp import gp_figures
 from bayesrace.operation.report.style import INK, WARNING, look, panel
 from bayesrace.operation.terminal import SMOOTHNESS, SYMBOLS, UNCERTAIN
 from bayesrace.operation.terminal.terminal import Stage, Stages
-from bayesrace.studies.paper.experiment import Figures, Finding, Section, at_most, stored
+from bayesrace.studies.paper.experiment import GP, Figures, Finding, Section, at_most, stored
 from bayesrace.studies.paper.loop import LIMITS, course
-from bayesrace.studies.paper.published import GP
 from bayesrace.tracks import Track
 from bayesrace.vehicles import CarParameters
 from bayesrace.vehicles.models import Model, dynamic, e_kinematic, kinematic
