@@ -165,10 +165,9 @@ class FmuHost:
                 self._plant, worker = socket.socketpair(type=socket.SOCK_SEQPACKET)
                 ours.enter_context(self._plant)
                 with worker:
-                    # Ctrl-C at the terminal is for the plant, which ends the run in order. What an
-                    # FMU writes beside itself is removed with it.
+                    # Ctrl-C at the terminal is for the plant, which ends the run in order.
                     process = Popen(
-                        (*RUN_MODULE, _WORKER, str(worker.fileno()), str(binary)), cwd=folder,
+                        (*RUN_MODULE, _WORKER, str(worker.fileno()), folder, binary),
                         stdin=PIPE, stdout=PIPE, stderr=STDOUT, pass_fds=(worker.fileno(),),
                         start_new_session=True,
                     )  # fmt: skip

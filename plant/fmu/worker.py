@@ -1,10 +1,9 @@
 """The process that an FMU runs in: whatever the FMU does to its process, it does to this one.
 
-:class:`bayesrace.plant.fmu.host.FmuHost` runs this module in the FMU's folder, with its own end of
-standard input, which closes when the plant ends. The first question says on which processors to run
-and which inputs and outputs count. The others are a mapping of start values, or what
-:meth:`_Instance.step` takes. The answer is the outputs (zeros before a start), or a text that says
-what failed.
+:class:`bayesrace.plant.fmu.host.FmuHost` runs this module; its standard input ends when the plant
+ends. The first question says on which processors to run and which inputs and outputs count. The
+others are a mapping of start values, or what :meth:`_Instance.step` takes. The answer is the
+outputs (zeros before a start), or a text that says what failed.
 """
 
 import os
@@ -16,7 +15,6 @@ import threading
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
-from pathlib import Path
 from typing import Any, Final
 
 from fmpy import read_model_description
@@ -35,9 +33,9 @@ _LONGEST_MESSAGE: Final = 1000
 """Characters of the FMU's log."""
 
 
-def _serve(plant: socket.socket, library: str) -> None:
-    """Loads the FMU that lies in the current folder and answers the plant until it sends None."""
-    folder = str(Path.cwd())
+def _serve(plant: socket.socket, folder: str, library: str) -> None:
+    """Loads the unpacked FMU and answers the plant until it sends None."""
+    os.chdir(folder)  # what an FMU writes beside itself is removed with it
     plant.set_inheritable(False)  # not for what the FMU starts
     watch = threading.Thread(target=_end_with_the_plant, args=(folder,), daemon=True)
     watch.start()
@@ -181,4 +179,4 @@ class _Instance:
 
 
 if __name__ == "__main__":
-    _serve(socket.socket(fileno=int(sys.argv[1])), sys.argv[2])
+    _serve(socket.socket(fileno=int(sys.argv[1])), *sys.argv[2:])
