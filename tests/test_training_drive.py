@@ -139,4 +139,4 @@ def test_a_race_reports_its_training_drive(
     page = write_report(run).read_text()
     assert said in page
     section = page.split('<section id="training">')[1].split("</section>")[0]
-    assert section.count("<svg ") == 4  # the map, and three pictures of the states
+    assert section.count("<svg ") == 1  # the map
