@@ -19,6 +19,7 @@ from bayesrace.errors import InputError
 from bayesrace.messages import (
     EVENT,
     ROLLBACK,
+    RUN,
     STATE,
     STATUS,
     STOP,
@@ -26,9 +27,11 @@ from bayesrace.messages import (
     Role,
     RollbackRequest,
     Service,
+    Status,
     StatusRequest,
     StopRequest,
     car_key,
+    decode,
     encode,
 )
 from bayesrace.transport import (
@@ -246,6 +249,43 @@ def test_a_request_beyond_the_limit_is_rejected_as_busy(
     assert all(len(list(answers)) == 1 for answers in waiting)
 
 
+def test_requests_for_the_status_share_one_place_and_one_answer(pair: tuple[Any, Any]) -> None:
+    server, client = Inbox(pair[0], "orca"), Inbox(pair[1], "orca")
+    server.serve(STATUS, "plant")
+    server.serve(RUN)
+    meet(server, client)
+    key = car_key(STATUS.key, "orca", "plant")
+    request = encode(StatusRequest(seq=0, source_time_ns=0))
+    waiting = [pair[1].get(key, payload=request, timeout=10.0) for _ in range(100)]
+    until(lambda: server.requests_rejected == 84, "more than may share an answer")
+    shared = take(server, Kind.REQUEST).value
+    later = pair[1].get(key, payload=request, timeout=10.0)
+    shared.answer(messages.status(seq=1))
+    take(server, Kind.REQUEST).value.answer(messages.status(seq=2))
+    found = [decode(Status, one.ok.payload.to_bytes()).seq for one in later]
+    assert found == [2]
+    assert sum(one.ok is not None for answers in waiting for one in answers) == 16
+
+
+def test_a_stop_is_taken_before_requests_that_wait_for_longer(pair: tuple[Any, Any]) -> None:
+    server, client = Inbox(pair[0], "orca"), Inbox(pair[1], "orca")
+    for service in (RUN, STOP):
+        server.serve(service)
+    meet(server, client)
+    runs = [pair[1].get(car_key(RUN.key, "orca"), timeout=10.0) for _ in range(20)]
+    until(lambda: server.requests_rejected == 4, "all places of other requests to be taken")
+    stop = pair[1].get(car_key(STOP.key, "orca"), timeout=10.0)
+    until(lambda: server.queued == 17, "the stop")
+    names = []
+    for _ in range(17):
+        item = take(server, Kind.REQUEST)
+        names.append(item.name)
+        item.value.answer(messages.reply(True))
+    assert names == ["stop"] + 16 * ["run"]
+    assert len(list(stop)) == 1
+    assert sum(one.ok is not None for answers in runs for one in answers) == 16
+
+
 def test_a_lost_request_is_repeated_but_for_a_rollback(pair: tuple[Any, Any]) -> None:
     """As when a link breaks because a machine stalls."""
     asker, answerer = pair
@@ -254,7 +294,7 @@ def test_a_lost_request_is_repeated_but_for_a_rollback(pair: tuple[Any, Any]) ->
     def answer(request: Request) -> None:
         heard.append(request.service.name)
         if len(heard) % 2:
-            threading.Timer(0.8, request._query.drop).start()
+            threading.Timer(0.8, request._queries[0].drop).start()
         else:
             request.answer(messages.reply(True, "yes"))
 

@@ -99,6 +99,10 @@ class Service(Generic[M, A]):
     timeout_s: float
     repeatable: bool = True
     """Idempotent: a client repeats a request that was lost with its link."""
+    urgent: bool = False
+    """Served before what else waits, in places of its own."""
+    shared: bool = False
+    """All requests that wait have one place, and one answer."""
 
 
 _CONTROL: Final = Qos("real_time", express=True)
@@ -143,11 +147,12 @@ RUN: Final = Service(
     "run", "bayesrace/{car}/plant/run", RunRequest, Reply, ("plant",), ("director",), 20.0, False
 )
 STOP: Final = Service(
-    "stop", "bayesrace/{car}/plant/stop", StopRequest, Reply, ("plant",), ("director",), 5.0, False
-)
+    "stop", "bayesrace/{car}/plant/stop", StopRequest, Reply, ("plant",), ("director",), 5.0, False,
+    urgent=True,
+)  # fmt: skip
 STATUS: Final = Service(
     "status", "bayesrace/{car}/{source}/status", StatusRequest, Status, ("plant", "controller"),
-    ("plant", *_WATCHING), 5.0,
+    ("plant", *_WATCHING), 5.0, shared=True,
 )  # fmt: skip
 """The plant asks how many controllers there are."""
 WEIGHTS: Final[Service[Message, Reply]] = Service(
@@ -162,7 +167,7 @@ ROLLBACK: Final = Service(
 )  # fmt: skip
 COMMAND: Final = Service(
     "command", "bayesrace/{car}/controller/command", Command, Reply, ("controller",),
-    ("director",), 5.0,
+    ("director",), 5.0, urgent=True,
 )  # fmt: skip
 SERVICES: Final[tuple[Service[Any, Any], ...]] = (
     RUN, STOP, STATUS, WEIGHTS, ROLLBACK, COMMAND

@@ -33,7 +33,8 @@ _CAPACITY: Final = 10_000
 """Items that wait at most; a thread this far behind is broken, and memory must not follow it."""
 
 _REQUESTS: Final = 16
-"""Requests that wait at most; more are rejected, so that no backlog builds up."""
+"""Requests that wait at most, urgent and other ones, and that share an answer; more are rejected,
+so that no backlog builds up."""
 
 NEWEST: Final = 1024
 """Messages of the control path that wait at most; a thread this far behind needs the newest."""
@@ -113,7 +114,13 @@ class Inbox:
         self._queue_was_last = False
         self.alive: set[str] = set()
         """Sources whose liveliness token is there, as of the items taken so far."""
-        self._room = threading.Semaphore(_REQUESTS)
+        self._lock = threading.Lock()
+        """Of the following, which the transport's threads change, too."""
+        self._urgent: deque[Item] = deque()
+        self._others: deque[Item] = deque()
+        """Requests that wait. The queue has as many of their items, and so wakes the owner."""
+        self._shared: dict[str, Request] = {}
+        """By the service's name, the request that waits and that others may join."""
         self.overflowed = 0
         """Items lost because the queue was full."""
         self.requests_rejected = 0
@@ -149,12 +156,14 @@ class Inbox:
         return decoder
 
     def serve(self, service: Service[Any, Any], source: str = "") -> None:
-        """Receive the service's requests; those beyond the limit are rejected and counted."""
+        """Receive the service's requests; those beyond the limit are rejected and counted.
+
+        Whoever may only look on cannot use up the places of others: requests of a ``shared``
+        service have one, and ``urgent`` ones are taken first.
+        """
 
         def on_request(request: Request) -> None:
-            if self._room.acquire(blocking=False):
-                self.put(Item(Kind.REQUEST, service.name, request, time.monotonic_ns()))
-            else:
+            if not self._admit(service, request):
                 self.requests_rejected += 1
                 request.reject(f"{_REQUESTS} requests are waiting; try again")
 
@@ -266,6 +275,28 @@ class Inbox:
 
         return self._session.declare_subscriber(key, in_transport_thread(on_sample))
 
+    def _admit(self, service: Service[Any, Any], request: Request) -> bool:
+        """In the transport's thread."""
+        with self._lock:
+            if waiting := self._shared.get(service.name):
+                return waiting.join(request, _REQUESTS)
+            requests = self._urgent if service.urgent else self._others
+            if len(requests) >= _REQUESTS:
+                return False
+            if service.shared:
+                self._shared[service.name] = request
+            item = Item(Kind.REQUEST, service.name, request, time.monotonic_ns())
+            requests.append(item)
+        self.put(item)
+        return True
+
+    def _next_request(self) -> Item:
+        """In place of the one that the queue has given; nobody joins it from now on."""
+        with self._lock:
+            item = (self._urgent or self._others).popleft()
+            self._shared.pop(item.name, None)
+        return item
+
     def _offer(self, kind: Kind, name: str, value: Any, key: str) -> None:
         """In the transport's thread: another process must not fill the memory."""
         if self._queue.qsize() < self._capacity:
@@ -314,5 +345,5 @@ class Inbox:
         elif item.kind is Kind.GONE:
             self.alive.discard(item.name)
         elif item.kind is Kind.REQUEST:
-            self._room.release()
+            return self._next_request()
         return item

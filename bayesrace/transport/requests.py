@@ -173,17 +173,24 @@ def send_rollback(session: Any, car: str, text: str, timeout_s: float | None = N
 
 
 class Request:
-    """A pending request; answer it once."""
+    """A pending request, with those that have joined it; answer it once."""
 
     def __init__(self, service: Service[Any, Any], query: Any, max_bytes: int | None) -> None:
         """``max_bytes``: a longer payload is not copied, which would block other threads."""
         self.service = service
-        self._query = query
+        self._queries = [query]
         payload = query.payload
         self.size = 0 if payload is None else len(payload)
         """Bytes of the payload as sent."""
         fits = max_bytes is None or self.size <= max_bytes
         self.payload: bytes = payload.to_bytes() if payload is not None and fits else b""
+
+    def join(self, other: "Request", most: int) -> bool:
+        """Let ``other`` have the same answer; False if ``most`` requests have it already."""
+        if len(self._queries) >= most:
+            return False
+        self._queries += other._queries
+        return True
 
     def answer(self, message: Message) -> None:
         """Send the answer; it is dropped if the client has gone."""
@@ -210,13 +217,14 @@ class Request:
         self._end(lambda query: query.reply_err(_BUSY + why))
 
     def _end(self, reply: Callable[[Any], None]) -> None:
-        query, self._query = self._query, None
-        try:
-            reply(query)
-        except zenoh.ZError:
-            pass
-        finally:
-            query.drop()
+        queries, self._queries = self._queries, []
+        for query in queries:
+            try:
+                reply(query)
+            except zenoh.ZError:
+                pass
+            finally:
+                query.drop()
 
 
 def declare_service(

@@ -15,9 +15,20 @@ import pytest
 from bayesrace.configuration import read_configuration
 from bayesrace.errors import InputError
 from bayesrace.log import LogReader
-from bayesrace.messages import ACTUATION, STATE, Role, car_key, encode
+from bayesrace.messages import (
+    ACTUATION,
+    COMMAND,
+    STATE,
+    STOP,
+    Command,
+    Role,
+    StopRequest,
+    car_key,
+    encode,
+)
 from bayesrace.operation.certificates import add, init
-from bayesrace.transport import Endpoints, free_endpoint, open_session
+from bayesrace.transport import Endpoints, ask, free_endpoint, open_session
+from tests.driven import blank
 from tests.network.cars import Course, Program
 from tests.network.observer import STANDING_MPS
 from tests.programs import PATIENCE_S, ROOT, run, until
@@ -139,6 +150,61 @@ def test_forged_messages_reach_nobody_and_the_car_stays_on_the_track(
         check_untouched(rig, before)
         journey = rig.journey()
     assert journey.off_track_m() <= 0
+
+
+# Asked without end -----------------------------------------------------------------------------
+
+
+@contextmanager
+def asking(rig: Rig, endpoint: str, source: str, rate: int, least: int) -> Iterator[None]:
+    """For the block, a viewer asks for the status of a process; at ``least`` so often."""
+    flood = subprocess.Popen(
+        [
+            sys.executable, "-m", "tests.security.flood", endpoint, rig.bundles.path("viewer"),
+            source, str(rate),
+        ],
+        cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    assert flood.stdout is not None
+    assert flood.stdout.readline() == "asking\n"
+    try:
+        yield
+    finally:
+        out, _ = flood.communicate("", timeout=PATIENCE_S)
+    assert int(out) >= least
+
+
+@pytest.mark.check
+@pytest.mark.parametrize("rate", [30, 1280])
+def test_each_stop_gets_through_while_viewers_ask_for_the_status_without_end(
+    tmp_path: Path, course: Course, bundles: Bundles, rate: int
+) -> None:
+    with secured(tmp_path, course, bundles) as rig, ExitStack() as stack:
+        rig.drive(1, lockstep=False, laps=0)
+        until(lambda: rig.phase() == "driving", "driving")
+        configuration = read_configuration(rig.config)
+        director = stack.enter_context(
+            open_session(configuration.endpoints("director"), "director")
+        )
+        plant, controller = configuration.network.plant[0], configuration.network.controller[0]
+        for where, source in (
+            (plant, "plant"),
+            (controller, "controller"),
+            (controller, "controller"),
+        ):
+            stack.enter_context(asking(rig, where, source, rate, least=2 * rate))
+        time.sleep(1.0)
+        took_s = []
+        for _ in range(20):
+            for word in ("stop", "go"):
+                begin_s = time.monotonic()
+                assert ask(director, COMMAND, CAR, blank(Command, command=word)).accepted
+                took_s.append(time.monotonic() - begin_s)
+        assert max(took_s) < 0.5
+        begin_s = time.monotonic()
+        assert ask(director, STOP, CAR, blank(StopRequest)).accepted
+        assert time.monotonic() - begin_s < 0.5
+        assert rig.end(1).data["reason"] == "stopped"
 
 
 # Replayed ----------------------------------------------------------------------------------------
