@@ -161,14 +161,14 @@ def _cars(endpoints: Endpoints, own: Credentials | None) -> Iterator[Check]:
 def probe(endpoint: str, credentials: Credentials | None) -> str:
     """What is wrong with an endpoint, and the remedy; empty if nothing is found within some 1.5 s.
 
-    Others than tcp and tls are not tried.
+    Others than tcp, tls and Unix sockets are not tried.
     """
     address = address_of(endpoint)
-    if address.protocol not in ("tcp", "tls"):
+    if address.protocol not in ("tcp", "tls", "unixsock-stream"):
         return ""
     try:
-        connection = socket.create_connection((address.host, address.port), _CONNECT_S)
-    except ConnectionRefusedError:
+        connection = _connected(address)
+    except (ConnectionRefusedError, FileNotFoundError):
         return f"nothing listens at {endpoint}: start its process, or correct the endpoint"
     except socket.gaierror:
         return f"{endpoint}: the name '{address.host}' is not known: correct it, or give an address"
@@ -177,11 +177,26 @@ def probe(endpoint: str, credentials: Credentials | None) -> str:
     except OSError as error:
         return f"{endpoint} cannot be reached: {error.strerror or error}; check address and network"
     with connection:
+        if address.protocol == "unixsock-stream":
+            return ""
         if credentials is None:
             text = _asks_for_certificates(connection)
         else:
             text = _refused(connection, address, credentials)
     return f"{endpoint} {text}" if text else ""
+
+
+def _connected(address: Address) -> socket.socket:
+    if address.protocol != "unixsock-stream":
+        return socket.create_connection((address.host, address.port), _CONNECT_S)
+    connection = socket.socket(socket.AF_UNIX)
+    try:
+        connection.settimeout(_CONNECT_S)
+        connection.connect(address.host)
+    except OSError:
+        connection.close()
+        raise
+    return connection
 
 
 def _asks_for_certificates(connection: socket.socket) -> str:

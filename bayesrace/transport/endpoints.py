@@ -36,7 +36,7 @@ _OURS: Final = (
 """Zenoh's settings that follow from ours, or that would let others in past them."""
 
 _ENDPOINT: Final = re.compile(
-    r"(?P<local>unixsock-stream)/[^\s#?]+([?#]\S*)?"
+    r"(?P<local>unixsock-stream)/(?P<path>[^\s#?]+)([?#]\S*)?"
     r"|(?P<protocol>tcp|udp|tls|quic|ws)/(?P<host>\[[^\]]+\]|[^:/\s]+):(?P<port>\d{1,5})([?#]\S*)?"
 )
 
@@ -66,7 +66,7 @@ def check_descriptors() -> None:
 
 
 class Address(NamedTuple):
-    """Protocol, host and port of an endpoint."""
+    """Protocol, host and port of an endpoint; of a Unix socket, its path as the host."""
 
     protocol: str
     host: str = ""
@@ -92,7 +92,7 @@ def address_of(endpoint: str) -> Address:
             f"{PLANT_ENDPOINT}, or unixsock-stream/path; protocols: tcp, udp, tls, quic, ws"
         )
     if match["local"]:
-        return Address(protocol=match["local"])
+        return Address(protocol=match["local"], host=match["path"])
     host = match["host"].strip("[]")
     return Address(protocol=match["protocol"], host=host, port=int(match["port"]))
 

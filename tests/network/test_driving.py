@@ -7,7 +7,12 @@ declarations over it once as well, so a connection that is made over a bad link 
 is why the drive by UDP begins on a good one.
 """
 
+import os
 import shutil
+import socket
+import stat
+import subprocess
+import textwrap
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
@@ -17,13 +22,15 @@ from typing import Any, Final
 
 import pytest
 
+from bayesrace.configuration import read_configuration
+from bayesrace.files import temporary_folder
 from bayesrace.log import LogReader
 from bayesrace.messages import STATE
 from bayesrace.transport import free_endpoint
 from tests.network.cars import Course, Program, gentle_course, start_controller, start_plant
 from tests.network.observer import STANDING_MPS, Journey, Observer, drive_on, observing
 from tests.network.proxy import Proxy
-from tests.programs import PATIENCE_S, run, until
+from tests.programs import PATIENCE_S, ROOT, run, until
 
 pytestmark = [pytest.mark.wall_clock, pytest.mark.unmeasured]
 
@@ -243,3 +250,51 @@ def test_two_machines_from_nothing(tmp_path: Path) -> None:
         assert doctor.returncode == 0, doctor.stdout
         assert "car 'orca': controller and plant" in doctor.stdout
     assert max(state.lap for state in LogReader(log).select(STATE)) == 1
+
+
+@pytest.mark.check
+def test_one_machine_with_other_users_from_nothing() -> None:
+    """As docs/security.md sets it up: the home is open to others, the folder of sockets is not."""
+    page = (ROOT / "docs" / "security.md").read_text().partition("**One machine with other users.")
+    commands = textwrap.dedent(page[2].partition("\n\n")[2].partition("\n\n")[0])
+    with temporary_folder("/tmp") as home:  # noqa: S108 (a socket's path is short)
+        home.chmod(0o755)
+        course = gentle_course(home)
+        yours = {**os.environ, "HOME": str(home)}
+        subprocess.run(["sh", "-euc", commands], cwd=home, env=yours, check=True)
+        given = ("--config", home / "bayesrace.toml")
+        doctor = run("doctor", *given)
+        assert doctor.returncode == 1
+        assert f"nothing listens at unixsock-stream/{home}" in doctor.stdout
+        lap = ("drive", "--track", course.track_file, "--laps", "1", "--mode", "realtime")
+        with (
+            Program(home / "plant.txt", "plant", *given),
+            Program(home / "out.txt", "controller", *course.arguments, *given) as controller,
+        ):
+            driven = run(*lap, "--log", home / "run.mcap", *given)
+            assert driven.returncode == 0, driven.stderr + controller.said()
+            doctor = run("doctor", *given)
+            assert doctor.returncode == 0, doctor.stdout
+            for endpoint in read_configuration(home / "bayesrace.toml").network.everyone:
+                path = endpoint.removeprefix("unixsock-stream/")
+                assert stat.S_IMODE(Path(path).parent.stat().st_mode) == 0o700
+                connect(path)
+                if os.geteuid() == 0:
+                    with another_user(), pytest.raises(PermissionError):
+                        connect(path)
+
+
+def connect(path: str) -> None:
+    """Like any process that knows the socket's path."""
+    with socket.socket(socket.AF_UNIX) as one:
+        one.connect(path)
+
+
+@contextmanager
+def another_user() -> Iterator[None]:
+    """This process is nobody for the block."""
+    os.seteuid(65534)
+    try:
+        yield
+    finally:
+        os.seteuid(0)
