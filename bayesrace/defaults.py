@@ -8,10 +8,13 @@ per_unit=1000)]``; :mod:`bayesrace.operation.cli.declaration` makes options of f
 from dataclasses import dataclass
 from typing import Final
 
-__all__ = ["CONFIGURATION_VARIABLE", "DEFAULT_CAR", "Option"]
+__all__ = ["CONFIGURATION_VARIABLE", "DEFAULT_CAR", "HEARTBEAT_VARIABLE", "Option"]
 
 CONFIGURATION_VARIABLE: Final = "BAYESRACE_CONFIG"
 """Environment variable that names the configuration."""
+
+HEARTBEAT_VARIABLE: Final = "BAYESRACE_HEARTBEAT"
+"""Environment variable that names the file of a process whose time each heartbeat renews."""
 
 DEFAULT_CAR: Final = "orca"
 """Name of the car that is meant where none is named."""

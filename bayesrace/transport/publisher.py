@@ -1,11 +1,16 @@
 """Topics with the table's quality of service, a process's heartbeat, and how losses are counted."""
 
+import os
 import time
 from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
 from typing import Any, Final, Generic, Literal, TypeVar
 
 import zenoh
 
+from bayesrace.defaults import HEARTBEAT_VARIABLE
+from bayesrace.errors import InputError
 from bayesrace.messages import HEARTBEAT, Message, Status, Topic, car_key, encode
 
 __all__ = ["HEARTBEAT_S", "Heartbeat", "Numbering", "Publisher"]
@@ -54,11 +59,22 @@ class Publisher(Generic[M]):
 
 
 class Heartbeat:
-    """Publishes the status when it is due; call :meth:`beat` as often as convenient."""
+    """Publishes the status when it is due; call :meth:`beat` as often as convenient.
+
+    Renews the time of the file that ``BAYESRACE_HEARTBEAT`` names, if it names one, as well: for
+    health checks that have no certificate. InputError if there can be no such file.
+    """
 
     def __init__(self, session: Any, car: str, source: Literal["plant", "controller"]) -> None:
         self._publisher = Publisher(session, HEARTBEAT, car, source)
         self._due_ns = 0
+        name = os.environ.get(HEARTBEAT_VARIABLE)
+        try:
+            self._file = Path(name).open("ab") if name else None  # noqa: SIM115 (while it runs)
+        except OSError as error:
+            raise InputError(
+                f"{HEARTBEAT_VARIABLE}={name}: {error.strerror}; name a file that can be written"
+            ) from None
 
     def beat(self, status: Callable[[int], Status]) -> None:
         """Publish ``status(seq)`` if it is due."""
@@ -68,6 +84,9 @@ class Heartbeat:
         # On a grid, so that a loop's jitter does not slow it; a new grid after a stall.
         self._due_ns = max(self._due_ns + _PERIOD_NS, now_ns + _PERIOD_NS // 2)
         self._publisher.put(status(self._publisher.next_seq), lockstep=False)
+        if self._file is not None:
+            with suppress(OSError):  # a health check may fail, but not the control loop for it
+                os.utime(self._file.fileno())
 
 
 class Numbering:
