@@ -1,5 +1,5 @@
-"""Names that options have by default, and what of an option does not follow from its field of
-settings; a module of its own, so that ``--help`` needs no other.
+"""Names that options have by default, bounds that several parts share, and what of an option does
+not follow from its field of settings; a module of its own, so that ``--help`` needs no other.
 
 An :class:`Option` stands beside the field, as ``delay_s: Annotated[float, Option(unit="ms",
 per_unit=1000)]``; :mod:`bayesrace.operation.cli.declaration` makes options of fields.
@@ -8,7 +8,10 @@ per_unit=1000)]``; :mod:`bayesrace.operation.cli.declaration` makes options of f
 from dataclasses import dataclass
 from typing import Final
 
-__all__ = ["CONFIGURATION_VARIABLE", "DEFAULT_CAR", "HEARTBEAT_VARIABLE", "Option"]
+__all__ = [
+    "CONFIGURATION_VARIABLE", "DEFAULT_CAR", "HEARTBEAT_VARIABLE", "MAX_POINTS", "MAX_WEIGHTS_BYTES",
+    "Option",
+]  # fmt: skip
 
 CONFIGURATION_VARIABLE: Final = "BAYESRACE_CONFIG"
 """Environment variable that names the configuration."""
@@ -18,6 +21,12 @@ HEARTBEAT_VARIABLE: Final = "BAYESRACE_HEARTBEAT"
 
 DEFAULT_CAR: Final = "orca"
 """Name of the car that is meant where none is named."""
+
+MAX_POINTS: Final = 4096
+"""Training points per output at most, so that weights with their samples are not too large."""
+
+MAX_WEIGHTS_BYTES: Final = 1 << 20
+"""Largest weights file, which is the largest message between processes."""
 
 
 @dataclass(frozen=True)

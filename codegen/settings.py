@@ -4,6 +4,7 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from bayesrace.defaults import MAX_POINTS
 from bayesrace.integrators import PERFECT, PREDICTION, Discretisation
 from bayesrace.vehicles import DEFAULT_CAR, CarParameters, CarSetting, default_car, get_car
 
@@ -44,7 +45,7 @@ class BuildSettings(BaseModel):
         description="of the stages after them, so many change alike; 1: no blocks; the car's "
         "without",
     )
-    gp_capacity: int = Field(1024, ge=8, le=16384, description="most points per output")
+    gp_capacity: int = Field(1024, ge=8, le=MAX_POINTS, description="most points per output")
 
     @property
     def stages(self) -> int:

@@ -5,6 +5,8 @@ from typing import Final, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from bayesrace.defaults import MAX_POINTS
+
 __all__ = [
     "DEFAULT_KERNELS",
     "MIN_SAMPLES",
@@ -43,7 +45,9 @@ class TrainingSettings(BaseModel):
     )
     restarts: int = Field(2, ge=0, le=100, description="further starts of the optimiser per kernel")
     seed: int = Field(0, ge=0, le=2**32 - 1, description="seed of the optimiser's starts")
-    capacity: int = Field(1024, ge=1, description="training points per output at most")
+    capacity: int = Field(
+        1024, ge=1, le=MAX_POINTS, description="training points per output at most"
+    )
     hyper_points: int = Field(
         400, ge=MIN_SAMPLES, description="samples that hyperparameters are found with at most"
     )

@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from bayesrace.defaults import MAX_POINTS, MAX_WEIGHTS_BYTES
 from bayesrace.errors import InputError
 from bayesrace.gp import weights as module
 from bayesrace.gp.weights import (
@@ -101,6 +102,19 @@ def test_encoding_round_trips(vx: GpOutput, vy: GpOutput, omega: GpOutput, creat
         assert np.array_equal(ours.inputs, theirs.inputs)
         assert np.array_equal(ours.alpha, theirs.alpha)
         assert ours.kernel == theirs.kernel
+
+
+def test_the_most_points_fit_into_what_can_be_sent() -> None:
+    """With samples to check them by; what does not fit is refused by whoever would write it."""
+    most: Any = tuple(make_output(seed, MAX_POINTS) for seed in range(3))
+    samples: Any = {"sample_features": np.ones((1000, 6)), "sample_residuals": np.ones((1000, 3))}
+    largest = replace(make_weights(), outputs=most, **samples)
+    assert decode_weights(encode_weights(largest)) == largest
+    many: Any = {name: np.repeat(rows, 10, axis=0) for name, rows in samples.items()}
+    with pytest.raises(InputError, match=f"more than {MAX_WEIGHTS_BYTES}"):
+        encode_weights(replace(largest, **many))
+    with pytest.raises(InputError, match=f"more than {MAX_POINTS}"):
+        make_output(0, MAX_POINTS + 1)
 
 
 @given(data=st.data())

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from bayesrace.defaults import MAX_WEIGHTS_BYTES
 from bayesrace.gp.weights import GpWeights, encode_weights, read_weights, write_weights
 from bayesrace.transport import free_endpoint
 from tests.command_line import Cli, refused
@@ -56,6 +57,9 @@ def test_what_are_no_weights_is_said_before_a_controller_is_looked_for(rig: Rig,
         path.write_bytes(content)
         refused(cli("publish", path), "damaged.bin", why)  # nobody is at the default endpoints
     refused(cli("publish", rig.folder / "nowhere.bin"), "nowhere.bin: No such file")
+    large = rig.folder / "large.bin"
+    large.write_bytes(bytes(MAX_WEIGHTS_BYTES + 1))  # Zenoh would drop it silently
+    refused(cli("publish", large), "large.bin is longer than 1 MB")
 
 
 def test_another_model_is_refused(rig: Rig, cli: Cli) -> None:

@@ -15,6 +15,7 @@ from unittest.mock import MagicMock
 
 import pytest
 
+from bayesrace.defaults import MAX_WEIGHTS_BYTES
 from bayesrace.errors import InputError
 from bayesrace.messages import (
     EVENT,
@@ -49,6 +50,7 @@ from bayesrace.transport import (
     free_endpoint,
     open_session,
     private_endpoints,
+    send_weights,
 )
 from bayesrace.transport import inbox as inbox_module
 from bayesrace.transport.session import unlinked, zenoh_config
@@ -320,6 +322,19 @@ def test_a_session_connects_when_its_peer_appears_and_sees_its_liveliness() -> N
             assert inbox.alive == {"plant"}
         assert take(inbox, Kind.GONE).name == "plant"
         assert inbox.alive == set()
+
+
+def test_weights_of_the_largest_size_arrive(pair: tuple[Any, Any]) -> None:
+    """A session that reassembled less would drop them silently."""
+    one, two = pair
+
+    def on_request(request: Request) -> None:
+        request.reply(True, "", {"size": len(request.payload)})
+
+    service = declare_service(one, WEIGHTS, "orca", on_request)
+    reply = send_weights(two, "orca", bytes(MAX_WEIGHTS_BYTES), timeout_s=10.0)
+    service.undeclare()
+    assert reply.data["size"] == MAX_WEIGHTS_BYTES
 
 
 def test_an_absent_peer_is_an_error_that_says_what_to_do() -> None:

@@ -219,7 +219,7 @@ def test_train_takes_one_kernel(files: Path, cli: Cli) -> None:
         ("validate weights.bin --on still.npz", "standstill"),
         ("train", "at least one log"),
         ("train driven.mcap --kernel cubic", "cubic"),
-        ("train driven.mcap --points 30000", "20000"),
+        ("train driven.mcap --points 5000", "4096"),
         ("train driven.mcap driven.mcap", "same samples"),
         ("train driven.mcap --car lorry", "lorry"),
         ("train driven.mcap --artefact nowhere", "bayesrace build"),

@@ -26,14 +26,13 @@ import numpy as np
 from pydantic import AfterValidator, Field, InstanceOf, PlainValidator, TypeAdapter, ValidationError
 
 from bayesrace.arrays import Floats
+from bayesrace.defaults import MAX_POINTS, MAX_WEIGHTS_BYTES
 from bayesrace.errors import InputError, faults_in
 from bayesrace.files import read_whole, write_whole
 
 __all__ = [
     "FEATURES",
     "KERNELS",
-    "MAX_BYTES",
-    "MAX_POINTS",
     "OUTPUTS",
     "SCHEMA",
     "UNITS",
@@ -60,15 +59,9 @@ FEATURES: Final = ("vx", "vy", "omega", "delta", "d", "delta_rate")
 KERNELS: Final = ("rbf", "matern05", "matern15", "matern25")
 """Kernel kinds: squared exponential, Matérn with nu = 0.5, 1.5, 2.5."""
 
-MAX_POINTS: Final = 20_000
-"""Upper limit of training points per output (a controller's capacity is far lower)."""
-
-MAX_BYTES: Final = 16 * 1024 * 1024
-"""Upper limit of the encoded size; longer data are refused before anything is parsed."""
-
 _MAX_PARTS: Final = 1000
-"""Maps and arrays in the encoded form at most; a file has some forty. Without a limit, 16 MB of
-empty arrays would take a second for every 2 MB, and 80 times their size in memory."""
+"""Maps and arrays in the encoded form at most; a file has some forty. Without a limit, empty arrays
+would take half a second for every MB, and 80 times their size in memory."""
 
 SCHEMA: Final = 3
 """Version of the encoded form; any other version is refused, older ones included: train again."""
@@ -270,12 +263,21 @@ def _packed(value: Any) -> Any:
 
 
 def encode_weights(weights: GpWeights) -> bytes:
-    """The one byte string for these weights; :func:`decode_weights` is its inverse."""
+    """The one byte string for these weights; :func:`decode_weights` is its inverse.
+
+    InputError if it is longer than what a controller can be sent.
+    """
     body = vars(weights) | {"features": FEATURES, "output_names": OUTPUTS}
     body["outputs"] = body.pop("outputs")  # the last of the map
     packed: bytes = msgpack.packb(body, default=_packed)
     head = _HEAD.pack(_MAGIC, SCHEMA)
-    return head + hashlib.sha256(head + packed).digest() + packed
+    data = head + hashlib.sha256(head + packed).digest() + packed
+    if len(data) > MAX_WEIGHTS_BYTES:
+        raise InputError(
+            f"GP weights: {len(data)} bytes are more than {MAX_WEIGHTS_BYTES}, the largest that a "
+            "controller can be sent: train with fewer points"
+        )
+    return data
 
 
 def _array(form: Any) -> Floats:
@@ -289,7 +291,7 @@ def _output(fields: Any) -> GpOutput:
 
 def _body(data: bytes) -> Any:
     """The msgpack body as plain values, after size, magic, schema and checksum are checked."""
-    if not _BODY_START <= len(data) <= MAX_BYTES:
+    if not _BODY_START <= len(data) <= MAX_WEIGHTS_BYTES:
         raise InputError(
             f"GP weights: {len(data)} bytes is not the size of a weights file; make one with "
             "'bayesrace train'"
@@ -366,7 +368,7 @@ def write_weights(path: str | os.PathLike[str], weights: GpWeights) -> None:
 
 def read_weights(path: str | os.PathLike[str]) -> GpWeights:
     """Weights from a file; InputError names the file and what is wrong with it."""
-    data = read_whole(Path(path), "weights file", MAX_BYTES)
+    data = read_whole(Path(path), "weights file", MAX_WEIGHTS_BYTES)
     try:
         return decode_weights(data)
     except InputError as error:

@@ -25,6 +25,7 @@ from typing import Any, Final
 
 import zenoh
 
+from bayesrace.defaults import MAX_WEIGHTS_BYTES
 from bayesrace.errors import InputError
 from bayesrace.messages import (
     ALIVE,
@@ -59,6 +60,10 @@ forwards between regions only, which suffices: processes of one region exchange 
 
 # One receiving worker hands over between threads less often than the default of two.
 _RUNTIME: Final = "(rx: (worker_threads: 1))"
+_MESSAGE_BYTES: Final = MAX_WEIGHTS_BYTES + 4096
+"""Largest message that is put together of its fragments, with its key and what else it has beside
+the payload. Zenoh does so before access control looks at it, so this bounds what any other end of a
+link can fill. It drops longer ones silently: senders have to refuse them."""
 _RETRY: Final = {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 1.5}
 _LINK_S: Final = 0.5
 """How long a session waits for its links before the log says that there are none yet."""
@@ -123,6 +128,7 @@ def zenoh_config(endpoints: Endpoints, role: Role, *, peers_follow: bool = False
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
         "transport/link/tx/lease": round(1e3 * limits.lease_s),
+        "transport/link/rx/max_message_size": _MESSAGE_BYTES,
         "transport/unicast/open_timeout": round(1e3 * limits.handshake_s),
         "transport/unicast/accept_timeout": round(1e3 * limits.handshake_s),
         "transport/unicast/accept_pending": limits.pending,

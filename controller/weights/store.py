@@ -12,9 +12,10 @@ from typing import Annotated, Final, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from bayesrace.defaults import MAX_WEIGHTS_BYTES
 from bayesrace.errors import InputError
 from bayesrace.files import read_text, read_whole, write_whole
-from bayesrace.gp.weights import MAX_BYTES, decode_weights, pack_weights
+from bayesrace.gp.weights import decode_weights, pack_weights
 
 __all__ = ["HISTORY", "AcceptedWeights", "History", "Store", "digest_of"]
 
@@ -125,7 +126,7 @@ class Store:
         entries = [start]
         for one in self._index.entries:
             with suppress(InputError):
-                data = read_whole(self._folder / one.file, "weights file", MAX_BYTES)
+                data = read_whole(self._folder / one.file, "weights file", MAX_WEIGHTS_BYTES)
                 packed = pack_weights(decode_weights(data))
                 if digest_of(data) == one.digest:
                     entries.append(one.model_copy(update={"data": data, "packed": packed}))

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Final, Literal
 
 import typer
 
+from bayesrace.defaults import MAX_POINTS
 from bayesrace.operation.cli import options
 from bayesrace.operation.cli.declaration import Given, options_of
 from bayesrace.operation.terminal import UNCERTAIN
@@ -72,7 +73,7 @@ def train(
         "rbf, matern05, matern15, matern25; auto: the best per output.", "auto"
     ),
     out: Path = options.out_file(Path("weights.bin")),
-    points: int = options.value("Points per output.", 400, min=20, max=20000),
+    points: int = options.value("Points per output.", 400, min=20, max=MAX_POINTS),
     artefact: Path | None = _ARTEFACT,
     car: str = options.value("Car that drove.", "", shown="named by the files"),
     name: str = options.CAR_NAME,

@@ -5,8 +5,8 @@ from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any
 
+from bayesrace.defaults import MAX_WEIGHTS_BYTES
 from bayesrace.files import read_whole
-from bayesrace.gp.weights import MAX_BYTES
 from bayesrace.messages import Event, Reply, Status
 from bayesrace.operation.learn.records import UpdateRecord, Verdict
 from bayesrace.operation.lifecycle import find, pick
@@ -146,7 +146,8 @@ class Publisher:
 
     def _send(self, update: UpdateRecord) -> None:
         def call() -> Reply:
-            data = read_whole(self._journal.folder / update.file, "weights file", MAX_BYTES)
+            path = self._journal.folder / update.file
+            data = read_whole(path, "weights file", MAX_WEIGHTS_BYTES)
             return send_weights(self._session, self._car, data)
 
         if not self.closed:

@@ -5,6 +5,7 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from bayesrace.defaults import MAX_POINTS
 from bayesrace.integrators import PREDICTION, Discretisation
 from bayesrace.vehicles import CarSetting, default_car
 
@@ -28,7 +29,7 @@ class LearnSettings(BaseModel):
         description="name of the car in the network; empty: the car's own",
     )
     discretisation: Discretisation = PREDICTION
-    points: int = Field(400, ge=20, le=20_000, description="training points per output")
+    points: int = Field(400, ge=20, le=MAX_POINTS, description="training points per output")
     keep: int = Field(1200, ge=100, le=20_000, description="samples kept from lap to lap")
     laps: int | None = Field(None, ge=1, description="end after so many laps")
     track: str | None = Field(
