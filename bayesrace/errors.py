@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final, get_args
 if TYPE_CHECKING:
     from pydantic import ValidationError
 
-__all__ = ["InputError", "faults_in"]
+__all__ = ["InputError", "RestartError", "TransientError", "faults_in"]
 
 _KINDS: Final = {
     "int": "a whole number", "float": "a number", "finite": "a finite number",
@@ -23,6 +23,16 @@ _KINDS: Final = {
 
 class InputError(ValueError):
     """Something given from outside is unusable; the message names it and says what would help."""
+
+
+class TransientError(InputError):
+    """The same of something that may become usable without this process: an endpoint in use, a
+    certificate that has expired or is not valid yet."""
+
+
+class RestartError(InputError):
+    """Ends a process that waits for such a thing when it is started again: exit code 75, temporary
+    failure in ``sysexits.h``."""
 
 
 def faults_in(

@@ -320,6 +320,7 @@ def follow(
 def route(endpoints: Endpoints) -> None:
     """Forward between all that connect to this process, until SIGINT or SIGTERM."""
     signals: queue.SimpleQueue[int] = queue.SimpleQueue()
-    with catching_signals(signals.put), open_session(endpoints, "router"):
+    # In this order: opening may wait for an endpoint, which a signal then ends.
+    with open_session(endpoints, "router"), catching_signals(signals.put):
         _log.info("router on %s", ", ".join(endpoints.listen))
         signals.get()

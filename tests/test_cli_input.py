@@ -2,7 +2,6 @@
 
 import os
 import resource
-import socket
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -159,14 +158,6 @@ def test_endpoints_that_cannot_be_used_are_refused(
     ):
         refused(cli(*command, "--endpoint", "nonsense"), "nonsense", "tcp/127.0.0.1:")
         refused(cli(*command, "--endpoint", "tcp/127.0.0.1:99999"), "99999", "port")
-    with socket.socket() as taken:
-        taken.bind(("127.0.0.1", 0))
-        taken.listen()
-        endpoint = f"tcp/127.0.0.1:{taken.getsockname()[1]}"
-        refused(cli("plant", "--endpoint", endpoint), endpoint, "in use", "another endpoint")
-        artefact = ("--artefact", kinematic_artefact)
-        outcome = cli("controller", *artefact, *course, "--listen", endpoint)
-        refused(outcome, endpoint, "in use", "another endpoint")
 
 
 def test_drive_without_plant_is_refused(cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:

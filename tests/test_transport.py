@@ -2,6 +2,7 @@
 
 import json
 import re
+import resource
 import signal
 import threading
 import time
@@ -53,6 +54,7 @@ from bayesrace.transport import (
     send_weights,
 )
 from bayesrace.transport import inbox as inbox_module
+from bayesrace.transport import session as session_module
 from bayesrace.transport.session import unlinked, zenoh_config
 from tests import sample_messages as messages
 from tests.command_line import Cli, refused
@@ -352,6 +354,16 @@ def test_a_taken_port_is_an_error_that_says_what_to_do() -> None:
         open_session(Endpoints(listen=(endpoint,))),
     ):
         pass
+
+
+def test_a_link_made_with_the_last_descriptor_ends_no_process() -> None:
+    """A flood of connections leaves none to look at the process's sockets with."""
+    before = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (0, before[1]))
+    try:
+        session_module._close_without_waiting()
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, before)
 
 
 @pytest.mark.parametrize(

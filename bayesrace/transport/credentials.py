@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Final, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from bayesrace.errors import InputError, faults_in
+from bayesrace.errors import InputError, TransientError, faults_in
 from bayesrace.files import read_text
 from bayesrace.messages import Role
 
@@ -106,7 +106,7 @@ class Credentials(BaseModel):
         """The content of a folder; InputError naming what cannot be used.
 
         Expired, of another authority than that of the folder, with another key: all is noticed
-        here, before there is a link.
+        here, before there is a link. TransientError: it has expired or is not valid yet.
         """
         folder = folder.expanduser().absolute()
         if not folder.is_dir():
@@ -176,9 +176,11 @@ class Credentials(BaseModel):
 
 
 @contextmanager
-def ending_on_expiry(credentials: Credentials) -> Iterator[None]:
+def ending_on_expiry(
+    credentials: Credentials, failure: type[InputError] = InputError
+) -> Iterator[None]:
     """For the block, the expiry of the certificate interrupts the main thread; then the end of the
-    block raises InputError with the reason. Zenoh closes such links, but opens them again.
+    block raises ``failure`` with the reason. Zenoh closes such links, but opens them again.
 
     Started in another thread, it only logs the reason. The log warns of the expiry each day for two
     weeks before.
@@ -208,10 +210,10 @@ def ending_on_expiry(credentials: Credentials) -> Iterator[None]:
             thread.join()
     except (InputError, KeyboardInterrupt) as error:
         if expired.is_set():
-            raise InputError(credentials.expired()) from error
+            raise failure(credentials.expired()) from error
         raise
     if expired.is_set():
-        raise InputError(credentials.expired())
+        raise failure(credentials.expired())
 
 
 def _outlasted(credentials: Credentials, over: threading.Event) -> bool:
@@ -276,8 +278,9 @@ def _verified(folder: Path) -> tuple[str, float]:
                 with suppress(ssl.SSLWantReadError):
                     end.do_handshake()
     except ssl.SSLCertVerificationError as error:
-        why = _UNUSABLE.get(error.verify_code)
-        why = why or f"is not of the authority in {AUTHORITY} ({error.verify_message}): {_COPY}"
+        if why := _UNUSABLE.get(error.verify_code):
+            raise TransientError(f"certificate in {folder} {why}") from None
+        why = f"is not of the authority in {AUTHORITY} ({error.verify_message}): {_COPY}"
         raise InputError(f"certificate in {folder} {why}") from None
     found = one.getpeercert() or {}
     subject = {str(pair[0]): str(pair[1]) for group in found["subject"] for pair in group}

@@ -10,6 +10,7 @@ in the other end's certificate. What the table does not allow to that name's rol
 dropped; a name that is not in the list of members may do nothing.
 """
 
+import errno
 import json
 import logging
 import os
@@ -26,7 +27,7 @@ from typing import Any, Final
 import zenoh
 
 from bayesrace.defaults import MAX_WEIGHTS_BYTES
-from bayesrace.errors import InputError
+from bayesrace.errors import InputError, RestartError, TransientError
 from bayesrace.messages import (
     ALIVE,
     ALIVE_SOURCES,
@@ -69,6 +70,16 @@ _LINK_S: Final = 0.5
 """How long a session waits for its links before the log says that there are none yet."""
 _LOOK_S: Final = 0.02
 """Time between two looks at the links of a session."""
+
+_SERVERS: Final[tuple[Role, ...]] = ("plant", "controller", "router")
+"""Processes that wait as long as they run, for an endpoint to listen on, too."""
+_LISTEN_S: Final = 0.5
+"""Time between two attempts to listen."""
+_PASSING: Final = (
+    errno.EADDRINUSE, errno.EADDRNOTAVAIL, errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM,
+)  # fmt: skip
+"""Why an endpoint cannot be listened on now, and may be later: another process has it or has just
+ended, the network of this machine is not up yet, the system is short of something."""
 
 # Zenoh's own tools name no region: they form one more, and clients another.
 _FILTERS: Final[list[dict[str, list[str]]]] = [
@@ -184,14 +195,15 @@ def open_session(
     Raises InputError if an endpoint is malformed, open to others without protection, or cannot be
     listened on, or if the certificate is not for the role. An absent peer is no error: the session
     connects as soon as it appears, and the log says that it waits. See :class:`.Inbox` for waiting
-    with a limit.
+    with a limit. Plant, controller and router also wait for an endpoint that they cannot listen on
+    now, such as one in use.
 
     ``peers_follow``: the caller starts the peers itself, just before or after this call. Opening
     the session then does not wait for them, and the log does not say that they are absent.
     ``reports_absence`` False: nor does it where the caller reports that, after a time limit.
 
     Where the process's certificate expires, the main thread gets a SIGINT, and the end of the block
-    raises InputError with the reason.
+    raises InputError with the reason: RestartError in a plant, controller or router.
     """
     os.environ.setdefault("ZENOH_RUNTIME", _RUNTIME)
     check_session(endpoints, role)
@@ -201,7 +213,8 @@ def open_session(
             "see docs/security.md", ", ".join(endpoints.exposed),
         )  # fmt: skip
     own = endpoints.credentials
-    ending = nullcontext() if own is None else ending_on_expiry(own)
+    failure = RestartError if role in _SERVERS else InputError
+    ending = nullcontext() if own is None else ending_on_expiry(own, failure)
     with _opened(endpoints, role, peers_follow) as session, ending:
         missing: list[str] = []
         if reports_absence and not peers_follow:
@@ -245,17 +258,20 @@ def _unlinked(session: Any, endpoints: Endpoints) -> list[str]:
 
 @contextmanager
 def _opened(endpoints: Endpoints, role: Role, peers_follow: bool) -> Iterator[Any]:
-    try:
-        with short_slices():
-            session = zenoh.open(zenoh_config(endpoints, role, peers_follow=peers_follow))
-    except zenoh.ZError as error:
-        text = re.sub(r" at /\S+", "", str(error).splitlines()[0])  # places in Zenoh's source
-        cause = re.search(r"[^:\[]+ \(os error \d+\)", text)
-        raise InputError(
-            f"cannot listen on {', '.join(endpoints.listen) or 'no endpoint'}: "
-            f"{(cause[0] if cause else text[:300]).strip()}; "
-            "choose another endpoint or end the process that uses it"
-        ) from None
+    said = ""
+    while True:
+        try:
+            with short_slices():
+                session = zenoh.open(zenoh_config(endpoints, role, peers_follow=peers_follow))
+            break
+        except zenoh.ZError as error:
+            failure = _not_opened(endpoints, error)
+        if role not in _SERVERS or not isinstance(failure, TransientError):
+            raise failure
+        if (text := str(failure)) != said:
+            _log.warning("%s; this goes on trying", text)
+        said = text
+        time.sleep(_LISTEN_S)
     on_link = in_transport_thread(lambda _: _close_without_waiting())
     with session:
         with short_slices():
@@ -265,6 +281,18 @@ def _opened(endpoints: Endpoints, role: Role, peers_follow: bool) -> Iterator[An
             yield session
 
 
+def _not_opened(endpoints: Endpoints, error: Exception) -> InputError:
+    """Why a session could not be opened; TransientError if that may pass."""
+    text = re.sub(r" at /\S+", "", str(error).splitlines()[0])  # places in Zenoh's source
+    cause = re.search(r"[^:\[]+ \(os error (\d+)\)", text)
+    passes = int(cause[1]) in _PASSING if cause else "lookup" in text  # of a host name
+    return (TransientError if passes else InputError)(
+        f"cannot listen on {', '.join(endpoints.listen) or 'no endpoint'}: "
+        f"{(cause[0] if cause else text[:300]).strip()}; "
+        "choose another endpoint or end the process that uses it"
+    )
+
+
 def _close_without_waiting() -> None:
     """Switches SO_LINGER off on this process's sockets; the system still delivers what was sent.
 
@@ -272,7 +300,11 @@ def _close_without_waiting() -> None:
     other end has stopped reading, closing its link would hold up the messages of all others for so
     long (eclipse-zenoh/zenoh#2350).
     """
-    for path in Path("/dev/fd").iterdir():
+    try:
+        paths = list(Path("/dev/fd").iterdir())
+    except OSError:  # a flood of connections has all descriptors: at the next link
+        return
+    for path in paths:
         try:
             one = socket.socket(fileno=int(path.name))
         except OSError:  # no socket, or closed since

@@ -17,13 +17,14 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 from typer.main import get_command
 
-from bayesrace.errors import InputError, faults_in
+from bayesrace.errors import InputError, RestartError, faults_in
 from bayesrace.operation.cli.declaration import Group, configured
 from bayesrace.processes import remembering_interrupts
 
 __all__ = ["app", "main"]
 
 _INTERRUPTED: Final = 130
+_RESTART: Final = 75
 
 _EXTRAS: Final = {
     "fmu": ("fmpy",),
@@ -159,7 +160,7 @@ def main() -> None:
         if text is None:
             raise
         ours = isinstance(error, RuntimeError) and not isinstance(error, RecursionError)
-        _fail(text, 1 if ours else 2)
+        _fail(text, _RESTART if isinstance(error, RestartError) else 1 if ours else 2)
 
 
 def _in_words(error: Exception) -> str | None:

@@ -1,12 +1,14 @@
 """``plant`` and ``controller``, to be run side by side or on two machines, ``router`` between them,
 and commands for those that run: ``status``, ``stop``, ``go``, ``doctor``."""
 
+import logging
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import typer
 
-from bayesrace.errors import InputError
+from bayesrace.errors import InputError, TransientError
 from bayesrace.operation.cli import options
 from bayesrace.operation.cli.declaration import Given, options_of
 from bayesrace.processes import die_with_parent
@@ -14,12 +16,17 @@ from bayesrace.processes import die_with_parent
 if TYPE_CHECKING:
     from bayesrace.configuration import Configuration
     from bayesrace.controller.process_settings import ControllerSettings
+    from bayesrace.messages import Role
     from bayesrace.operation.lifecycle import Action
     from bayesrace.plant.process_settings import PlantSettings
     from bayesrace.transport import Endpoints
 
 __all__ = ["controller", "doctor", "go", "plant", "router", "status", "stop"]
 
+_log = logging.getLogger("bayesrace.links")
+
+_COPYING: Final = 10
+"""So many seconds may pass while the files of a renewed certificate are copied one by one."""
 _NAME: Final = options.value("Name of the car.", "")
 _REASON: Final = options.value(
     "Reason, which the controller's status then shows.", "", metavar="TEXT"
@@ -57,8 +64,8 @@ def plant(
     from bayesrace.codegen.compiler import compiled
     from bayesrace.plant.process import main
 
-    endpoints = network.endpoints(
-        "plant", listen=endpoint, connect=connect, low_latency=low_latency
+    endpoints = _once_valid(
+        network, "plant", listen=endpoint, connect=connect, low_latency=low_latency
     )
     raise typer.Exit(main(settings(endpoints=endpoints, parent_pid=parent_pid), compiled))
 
@@ -96,8 +103,8 @@ def controller(
     from bayesrace.controller.process import main
     from bayesrace.controller.settings import GateSettings
 
-    endpoints = network.endpoints(
-        "controller", listen=listen, connect=endpoint, low_latency=low_latency
+    endpoints = _once_valid(
+        network, "controller", listen=listen, connect=endpoint, low_latency=low_latency
     )
     thresholds = read_settings(gate, GateSettings)
     chosen = settings(endpoints=endpoints, gate=thresholds, parent_pid=parent_pid)
@@ -121,10 +128,32 @@ def router(
     die_with_parent(parent_pid)
     from bayesrace.operation.lifecycle import route
 
-    endpoints = network.endpoints("router", listen=listen, connect=connect)
+    endpoints = _once_valid(network, "router", listen=listen, connect=connect)
     if not endpoints.listen:
         raise InputError("a router needs an endpoint: give --listen, or [network] router")
     route(endpoints)
+
+
+def _once_valid(network: "Configuration", role: "Role", **where: Any) -> "Endpoints":
+    """The endpoints of a process, once its certificate is valid.
+
+    The log says once that it has expired or is not valid yet: somebody may renew it, and the clock
+    of a board may be set after its start.
+    """
+    said, faults = "", 0
+    while True:
+        try:
+            return network.endpoints(role, **where)
+        except TransientError as error:
+            text, faults = str(error), 0
+        except InputError:
+            text, faults = said, faults + 1
+            if not said or faults > _COPYING:
+                raise
+        if text != said:
+            _log.warning("%s; this waits until then", text)
+        said = text
+        time.sleep(1.0)
 
 
 def status(

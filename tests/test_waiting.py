@@ -1,0 +1,160 @@
+"""Plant, controller and router wait for what may pass, as long as they run; each says so once."""
+
+import resource
+import signal
+import socket
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from datetime import timedelta
+from pathlib import Path
+from typing import Final
+
+import pytest
+
+from bayesrace.messages import Role
+from bayesrace.operation import certificates
+from bayesrace.operation.certificates import add, init
+from bayesrace.transport import free_endpoint
+from tests.network.cars import Course, Program, gentle_course
+from tests.programs import PATIENCE_S, until
+from tests.security.authority import Bundles, written
+
+pytestmark = pytest.mark.wall_clock
+
+SERVICES: Final[tuple[Role, ...]] = ("plant", "controller", "router")
+RUNNING: Final = {
+    "plant": "plant of car", "controller": "controller of car", "router": "router on",
+}  # fmt: skip
+IN_USE: Final = "Address already in use"
+CONNECTIONS: Final = 300
+
+
+@pytest.fixture(scope="module")
+def course(tmp_path_factory: pytest.TempPathFactory) -> Course:
+    return gentle_course(tmp_path_factory.mktemp("course"))
+
+
+def command(name: Role, course: Course, where: str) -> tuple[str | Path, ...]:
+    """A process that listens there, and that nobody meets."""
+    options: dict[Role, tuple[str | Path, ...]] = {
+        "plant": ("--endpoint", where), "router": ("--listen", where),
+        "controller": (*course.arguments, "--listen", where, "--endpoint", free_endpoint()),
+    }  # fmt: skip
+    return name, *options[name]
+
+
+def check_running(program: Program, name: Role) -> None:
+    """It runs now, and ends in order."""
+    until(lambda: RUNNING[name] in program.said(), f"{name}: {program.said()}")
+    program.end()
+
+
+# Endpoints ---------------------------------------------------------------------------------------
+
+
+@contextmanager
+def taken() -> Iterator[str]:
+    """An endpoint that something else listens at."""
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        yield f"tcp/127.0.0.1:{other.getsockname()[1]}"
+
+
+@pytest.mark.parametrize("name", SERVICES)
+def test_an_endpoint_in_use_is_waited_for(tmp_path: Path, course: Course, name: Role) -> None:
+    """Such as one that a process of somebody else has taken before the start."""
+    with ExitStack() as stack:
+        with taken() as where:
+            line = command(name, course, where)
+            program = stack.enter_context(Program(tmp_path / "said.txt", *line))
+            until(lambda: IN_USE in program.said(), "a line about the endpoint")
+            assert RUNNING[name] not in program.said()
+        check_running(program, name)
+    (said,) = (line for line in program.said().splitlines() if IN_USE in line)
+    assert where in said
+    assert "choose another endpoint" in said
+
+
+@pytest.mark.parametrize("name", SERVICES)
+def test_a_process_that_waits_for_an_endpoint_can_be_ended(
+    tmp_path: Path, course: Course, name: Role
+) -> None:
+    with taken() as where, Program(tmp_path / "said.txt", *command(name, course, where)) as program:
+        until(lambda: IN_USE in program.said(), "a line about the endpoint")
+        program.process.send_signal(signal.SIGTERM)
+        assert program.process.wait(PATIENCE_S) == -signal.SIGTERM
+
+
+@pytest.mark.parametrize(
+    ("where", "why"),
+    [
+        ("tcp/192.0.2.1:7447", "Cannot assign requested address"),
+        ("tcp/nowhere.invalid:7447", "failed to lookup"),
+    ],
+)
+def test_an_address_that_is_not_there_yet_is_waited_for(
+    tmp_path: Path, where: str, why: str
+) -> None:
+    """As at the start of a board whose network comes later."""
+    with Program(tmp_path / "said.txt", "plant", "--insecure", "--endpoint", where) as plant:
+        until(lambda: f"cannot listen on {where}: {why}" in plant.said(), "a line about it")
+        time.sleep(1.2)  # two more attempts
+        assert plant.process.poll() is None
+    assert plant.said().count(why) == 1
+
+
+# Certificates ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "wrong"), [*((name, "has expired") for name in SERVICES), ("plant", "not valid yet")]
+)
+def test_a_certificate_that_is_not_valid_now_is_waited_for(
+    tmp_path: Path, course: Course, monkeypatch: pytest.MonkeyPatch, name: Role, wrong: str
+) -> None:
+    """By the clock of a board without a battery, or until somebody copies a renewed one."""
+    folder, where = tmp_path / "certs", free_endpoint("tls")
+    init(folder)
+    with monkeypatch.context() as patch:
+        if wrong == "not valid yet":
+            patch.setattr(certificates, "_CLOCKS", timedelta(hours=-1))
+        add(folder, name, name, days=-0.5 if wrong == "has expired" else 1.0)
+    config = written(tmp_path, Bundles(folder), where, free_endpoint("tls"))
+    more: dict[Role, tuple[str | Path, ...]] = {
+        "controller": course.arguments, "router": ("--listen", where)
+    }  # fmt: skip
+    options = more.get(name, ())
+    with Program(tmp_path / "said.txt", name, *options, "--config", config) as program:
+        until(lambda: wrong in program.said(), f"that it {wrong}")
+        (folder / name / "certificate.pem").unlink()
+        time.sleep(1.5)  # half copied
+        add(folder, name, None, renew=True)
+        check_running(program, name)
+    assert program.said().count(wrong) == 1
+    assert "Traceback" not in program.said()
+
+
+# Descriptors -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", SERVICES)
+def test_idle_connections_beyond_the_soft_limit_are_accepted(
+    tmp_path: Path, course: Course, name: Role
+) -> None:
+    """The process raises its limit of descriptors at its start."""
+    where, limited = free_endpoint(), ("sh", "-c", 'ulimit -Sn 100 && exec "$@"', "sh")
+    line = command(name, course, where)
+    host, port = where.removeprefix("tcp/").split(":")
+    with ExitStack() as stack:
+        program = stack.enter_context(Program(tmp_path / "said.txt", *line, prefix=limited))
+        until(lambda: RUNNING[name] in program.said(), "it to run")
+        pid = program.process.pid
+        soft, hard = resource.prlimit(pid, resource.RLIMIT_NOFILE)
+        assert soft == hard > CONNECTIONS
+        for _ in range(CONNECTIONS):
+            stack.enter_context(socket.create_connection((host, int(port)), timeout=5.0))
+        descriptors = Path(f"/proc/{pid}/fd")
+        until(lambda: len(list(descriptors.iterdir())) > CONNECTIONS, "all to be accepted")
+    assert "panicked" not in program.said()
