@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from typing import Final
 
 __all__ = [
-    "CONFIGURATION_VARIABLE", "DEFAULT_CAR", "HEARTBEAT_VARIABLE", "MAX_POINTS", "MAX_WEIGHTS_BYTES",
-    "Option",
+    "CONFIGURATION_VARIABLE", "DEFAULT_CAR", "HEARTBEAT_VARIABLE", "MAX_POINTS",
+    "MAX_WEIGHTS_BYTES", "Option",
 ]  # fmt: skip
 
 CONFIGURATION_VARIABLE: Final = "BAYESRACE_CONFIG"
