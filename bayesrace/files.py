@@ -25,6 +25,7 @@ __all__ = [
     "read_whole",
     "replacing",
     "temporary_folder",
+    "write_private",
     "write_whole",
 ]
 
@@ -110,6 +111,13 @@ def replacing(path: Path) -> Iterator[Path]:
 def write_whole(path: Path, data: str | bytes) -> None:
     """The content of a file, text in UTF-8; see :func:`replacing`."""
     with replacing(path) as partial:
+        partial.write_bytes(data.encode() if isinstance(data, str) else data)
+
+
+def write_private(path: Path, data: str | bytes) -> None:
+    """The same, at no moment readable by others."""
+    with replacing(path) as partial:
+        partial.touch(0o600, exist_ok=False)
         partial.write_bytes(data.encode() if isinstance(data, str) else data)
 
 

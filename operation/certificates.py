@@ -27,7 +27,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from bayesrace.errors import InputError, faults_in
-from bayesrace.files import claimed, read_text, replacing, write_whole
+from bayesrace.files import claimed, read_text, write_private, write_whole
 from bayesrace.messages import Role, is_car_name
 from bayesrace.transport.credentials import (
     AUTHORITY,
@@ -252,8 +252,4 @@ def _alternatives(hosts: Sequence[str]) -> x509.SubjectAlternativeName:
 
 
 def _write_private(path: Path, key: ec.EllipticCurvePrivateKey) -> None:
-    """The key, at no moment readable by others."""
-    content = key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())
-    with replacing(path) as partial:
-        partial.touch(0o600, exist_ok=False)
-        partial.write_bytes(content)
+    write_private(path, key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption()))

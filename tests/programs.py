@@ -6,10 +6,12 @@ an orphan can be recognised whatever became of the race.
 
 import json
 import os
+import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -23,6 +25,7 @@ __all__ = [
     "PATIENCE_S",
     "ROOT",
     "Race",
+    "campaign_scheduler",
     "environment",
     "finish",
     "leftovers",
@@ -105,6 +108,29 @@ def leftovers(race: int, seconds: float = 20.0) -> dict[str, int]:
     while (alive := started_by(race)) and time.monotonic() < deadline:
         time.sleep(0.05)
     return alive
+
+
+@contextmanager
+def campaign_scheduler(folder: Path) -> Iterator[tuple[str, Path]]:
+    """Address and key of a scheduler for campaigns, which makes the key in the folder."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    address, key = f"tls://127.0.0.1:{port}", folder / "campaign.pem"
+    output = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    process = start("campaign-scheduler", "--key", key, "--listen", address, **output)
+
+    def listens() -> bool:
+        with suppress(OSError), socket.create_connection(("127.0.0.1", port)):
+            return True
+        return False
+
+    try:
+        until(listens, "the scheduler")
+        yield address, key
+    finally:
+        process.terminate()
+        process.wait()
 
 
 def peanut(path: Path) -> Path:

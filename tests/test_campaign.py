@@ -9,11 +9,7 @@ import json
 import os
 import shutil
 import signal
-import subprocess
-import sys
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+import stat
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +18,7 @@ import pytest
 from bayesrace.gp.weights import GpWeights, write_weights
 from bayesrace.vehicles import default_car, read_car, write_car
 from tests.command_line import Cli, refused
-from tests.programs import Race, finish, peanut, run, start, until
+from tests.programs import Race, campaign_scheduler, finish, peanut, run, start, until
 from tests.shared import session_folder
 
 pytestmark = [pytest.mark.check, pytest.mark.unmeasured]
@@ -148,29 +144,18 @@ def test_after_ctrl_c_and_a_kill_a_campaign_goes_on(folder: Path, whole: Path, c
     assert rows(out) == rows(whole)
 
 
-@contextmanager
-def scheduler(folder: Path) -> Iterator[str]:
-    """A Dask scheduler of its own."""
-    file = folder / "scheduler.json"
-    command = [str(Path(sys.executable).with_name("dask")), "scheduler", "--host", "127.0.0.1"]
-    options = ["--port", "0", "--no-dashboard", "--scheduler-file", str(file)]
-    process = subprocess.Popen(
-        [*command, *options], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-    )
-    try:
-        until(file.exists, "the scheduler's address")
-        time.sleep(0.2)
-        yield file.read_text().split('"address": "')[1].split('"')[0]
-    finally:
-        process.terminate()
-        process.wait()
-
-
-def test_workers_elsewhere_compute_for_a_scheduler(folder: Path, whole: Path) -> None:
+def test_workers_elsewhere_compute_for_a_scheduler(
+    folder: Path, whole: Path, cli: Cli, tmp_path: Path
+) -> None:
+    """All three have the key that the scheduler made; a campaign with another one is refused."""
     out = folder / "elsewhere"
-    with scheduler(folder) as address:
-        worker = start("campaign-worker", address, "--workers", "2")
-        done = run("campaign", folder / "plan.toml", "--out", out, "--scheduler", address)
+    command = ("campaign", folder / "plan.toml", "--out", out)
+    with campaign_scheduler(folder) as (address, key):
+        assert stat.S_IMODE(key.stat().st_mode) == 0o600
+        with campaign_scheduler(tmp_path) as (_, other):
+            refused(cli(*command, "--scheduler", address, "--key", other), address, "the same key")
+        worker = start("campaign-worker", address, "--key", key, "--workers", "2")
+        done = run(*command, "--scheduler", address, "--key", key)
         assert done.returncode == 0, done.stderr
     assert finish(worker).returncode == 0
     assert rows(out) == rows(whole)
@@ -214,8 +199,9 @@ def test_a_case_whose_workers_die_is_a_failed_row_and_reported(tmp_path: Path) -
     from distributed.scheduler import KilledWorker
 
     from bayesrace.operation.settings import RaceSettings
-    from bayesrace.studies.campaign.campaign import CampaignError, rows_of
+    from bayesrace.studies.campaign.campaign import rows_of
     from bayesrace.studies.campaign.case import Case
+    from bayesrace.studies.campaign.cluster import CampaignError
     from bayesrace.studies.campaign.report import render_campaign
     from bayesrace.studies.campaign.results import writing
 
@@ -256,9 +242,27 @@ def test_rows_are_those_of_a_race_over_zenoh(
         assert sum(row["off_track_samples"] for row in counted) == lap["off_track_samples"]
 
 
-def test_a_scheduler_that_is_not_there_is_named(folder: Path, cli: Cli) -> None:
-    options = ("--out", folder / "none", "--scheduler", "tcp://127.0.0.1:1")
-    refused(cli("campaign", folder / "plan.toml", *options), "tcp://127.0.0.1:1", "dask scheduler")
+def test_a_scheduler_that_is_not_there_or_not_secured_is_named(folder: Path, cli: Cli) -> None:
+    with campaign_scheduler(folder) as (address, key):
+        taken = run("campaign-scheduler", "--key", key, "--listen", address)
+    assert taken.returncode == 2
+    assert taken.stderr.splitlines()[-1].startswith(f"bayesrace: cannot listen at {address}")
+    command = ("campaign", folder / "plan.toml", "--out", folder / "none")
+    gone = cli(*command, "--scheduler", address, "--key", key)
+    refused(gone, address, "bayesrace campaign-scheduler")
+    for plain in ("tcp://127.0.0.1:1", "127.0.0.1:1", "tls://127.0.0.1", "tls://127.0.0.1:99999"):
+        refused(cli(*command, "--scheduler", plain, "--key", key), plain, "tls://HOST:8786")
+        refused(cli("campaign-worker", plain, "--key", key), plain, "tls://HOST:8786")
+        refused(cli("campaign-scheduler", "--listen", plain, "--key", key), plain, "tls://HOST")
+    refused(cli(*command, "--scheduler", address), "--key", "campaign-scheduler")
+    refused(cli(*command, "--key", key), "--scheduler")
+    refused(cli("campaign-worker", address, "--key", folder / "no.pem"), "no.pem", "copy")
+    other = folder / "other.pem"
+    other.write_text("no key")
+    other.chmod(0o600)
+    refused(cli("campaign-worker", address, "--key", other), "other.pem holds no key", "copy")
+    key.chmod(0o644)
+    refused(cli("campaign-worker", address, "--key", key), "others can read", "chmod 600")
 
 
 # Tuning ------------------------------------------------------------------------------------------

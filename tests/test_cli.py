@@ -27,7 +27,7 @@ SUBCOMMANDS = (
     "plant", "controller", "status", "stop", "go", "router", "latency",
     "fmu export", "fmu inspect", "fmu weights",
     "validate", "publish", "rollback", "learn",
-    "campaign", "campaign-report", "campaign-worker", "tune", "paper",
+    "campaign", "campaign-report", "campaign-scheduler", "campaign-worker", "tune", "paper",
     "config show", "config check", "config example", "doctor",
     "certs init", "certs add", "certs list", "certs revoke",
 )  # fmt: skip

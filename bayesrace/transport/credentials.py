@@ -27,7 +27,8 @@ if TYPE_CHECKING:
 
 __all__ = [
     "AUTHORITY", "CERTIFICATE", "CERTIFICATE_EXPIRED", "CERTIFICATE_NOT_YET", "COVERS", "EVERY_CAR",
-    "KEY", "MEMBERS", "NEWEST_LIST", "Credentials", "Member", "Members", "ending_on_expiry",
+    "KEY", "MEMBERS", "NEWEST_LIST", "Credentials", "Member", "Members", "check_private",
+    "ending_on_expiry",
 ]  # fmt: skip
 
 _log = logging.getLogger("bayesrace.links")
@@ -113,7 +114,7 @@ class Credentials(BaseModel):
             raise InputError(f"no certificate in {folder}: make one with 'bayesrace certs add'")
         for name in (AUTHORITY, CERTIFICATE, KEY, MEMBERS):
             read_text(folder / name, "file", _COPY)
-        _check_private(folder / KEY)
+        check_private(folder / KEY)
         name, ends_s = _verified(folder)
         return cls(folder=folder, name=name, ends_s=ends_s, members=_members(folder / MEMBERS))
 
@@ -237,7 +238,7 @@ def _members(path: Path) -> Members:
         raise InputError(f"{path}: {faults_in(error)}; copy it again") from None
 
 
-def _check_private(key: Path) -> None:
+def check_private(key: Path) -> None:
     """InputError if others can read the key: theirs may be a group, where root owns the file."""
     status = key.stat()
     forbidden = 0o077 if status.st_uid else 0o027

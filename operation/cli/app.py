@@ -46,7 +46,8 @@ _TASKS: Final = {
     "processes.go processes.router processes.doctor configuration.config configuration.certs",
     "Learn while driving": "learning.learn learning.publish learning.rollback",
     "Measure": "tracks.limit race.bench race.latency race.paper",
-    "Many laps": "race.campaign race.campaign_report race.campaign_worker race.tune",
+    "Many laps": "race.campaign race.campaign_report race.campaign_scheduler "
+    "race.campaign_worker race.tune",
     "Export to other tools": "export.export export.fmu",
 }
 """Sections of the help: commands, or groups of them, in the modules of this package."""

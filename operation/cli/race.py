@@ -1,5 +1,6 @@
 """``race``, ``report``, ``drive``, ``bench``, ``latency``, ``paper``, ``campaign``,
-``campaign-report``, ``campaign-worker``, ``tune``: whole runs, and what is measured with them."""
+``campaign-report``, ``campaign-scheduler``, ``campaign-worker``, ``tune``: whole runs, and what is
+measured with them."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -14,6 +15,7 @@ if TYPE_CHECKING:
     from bayesrace.configuration import Configuration
     from bayesrace.operation.analysis.race import RaceAnalysis
     from bayesrace.operation.settings import RaceSettings
+    from bayesrace.studies.campaign.cluster import Remote
     from bayesrace.studies.latency.settings import LatencySettings
     from bayesrace.studies.settings import BenchSettings, PaperSettings, TuneSettings
     from bayesrace.transport import Endpoints
@@ -22,6 +24,7 @@ __all__ = [
     "bench",
     "campaign",
     "campaign_report",
+    "campaign_scheduler",
     "campaign_worker",
     "drive",
     "latency",
@@ -32,8 +35,9 @@ __all__ = [
 ]
 
 _SCHEDULER: Final = options.value(
-    "Dask scheduler, as tcp://HOST:8786 or tls://HOST:8786.", metavar="ADDRESS", shown="embedded"
+    "Scheduler of several machines, as tls://HOST:8786.", metavar="ADDRESS", shown="embedded"
 )
+_KEY: Final = options.value("The scheduler's key, with --scheduler.", metavar="FILE")
 _WORKERS: Final = options.value(
     "Processes on this machine.", 0, min=0, max=1024, shown="one a core"
 )
@@ -219,6 +223,7 @@ def campaign(
     plan: Path = options.argument("PLAN", "TOML file that says what varies: docs/campaigns.md."),
     out: Path | None = options.out_folder("Folder of results.", "runs/NAME-OF-PLAN"),
     scheduler: str | None = _SCHEDULER,
+    key: Path | None = _KEY,
     workers: int = _WORKERS,
     again: bool = options.flag("--again", "Compute cases that failed once more."),
 ) -> None:
@@ -232,10 +237,11 @@ def campaign(
     from bayesrace.studies.campaign.plan import read_plan
     from bayesrace.studies.campaign.report import render_campaign
 
+    remote = _remote(scheduler, key)
     read = read_plan(plan)
     folder = out or Path("runs") / plan.stem
     console = Terminal()
-    outcome = run_campaign(read, folder, console, scheduler, workers, again)
+    outcome = run_campaign(read, folder, console, remote, workers, again)
     console.print(f"{len(read.cases)} cases; computed now: {outcome}", highlight=False)
     console.print(f"{render_campaign(folder)}", highlight=False, soft_wrap=True)
 
@@ -249,13 +255,42 @@ def campaign_report(
     typer.echo(str(render_campaign(folder)))
 
 
-def campaign_worker(
-    scheduler: str = options.argument("ADDRESS", "As tcp://HOST:8786."), workers: int = _WORKERS
+def campaign_scheduler(
+    key: Path = options.value(
+        "The key; made if it is not there.", ..., metavar="FILE", callback=options.writable
+    ),
+    listen: str = options.value("Address to listen at.", "tls://0.0.0.0:8786", metavar="ADDRESS"),
 ) -> None:
-    """Compute for a campaign elsewhere until its Dask scheduler ends."""
-    from bayesrace.studies.campaign.campaign import run_worker
+    """Hand out the cases of campaigns to workers on several machines, until interrupted.
 
-    run_worker(scheduler, workers)
+    Whoever has the key can run code here and on the workers. Copy it to where they and the campaign
+    run, readable by its user alone.
+    """
+    from bayesrace.studies.campaign.cluster import run_scheduler
+
+    run_scheduler(listen, key)
+
+
+def campaign_worker(
+    scheduler: str = options.argument("ADDRESS", "As tls://HOST:8786."),
+    key: Path = options.value("The scheduler's key.", ..., metavar="FILE"),
+    workers: int = _WORKERS,
+) -> None:
+    """Compute for campaigns elsewhere until their scheduler ends."""
+    from bayesrace.studies.campaign.cluster import Remote, run_worker
+
+    run_worker(Remote.checked(scheduler, key), workers)
+
+
+def _remote(scheduler: str | None, key: Path | None) -> "Remote | None":
+    """The scheduler that is not embedded; InputError if it is not secured."""
+    if scheduler is None:
+        if key is not None:
+            raise InputError("--key is of a scheduler: add --scheduler, or leave it out")
+        return None
+    from bayesrace.studies.campaign.cluster import Remote
+
+    return Remote.checked(scheduler, key)
 
 
 @options_of("bayesrace.studies.settings.TuneSettings", "track held_out trials batch car seed")
@@ -266,6 +301,7 @@ def tune(
         "SQLite of trials.", metavar="FILE", shown="beside --out", callback=options.writable
     ),
     scheduler: str | None = _SCHEDULER,
+    key: Path | None = _KEY,
     workers: int = _WORKERS,
 ) -> None:
     """Search weights of the OCP, margin, line friction and horizon that lap faster.
@@ -277,8 +313,9 @@ def tune(
     from bayesrace.studies.campaign.tune import print_verdict
     from bayesrace.studies.campaign.tune import tune as search
 
+    remote = _remote(scheduler, key)
     with options.stages_shown() as stages:
         storage = study or out.with_suffix(".sqlite")
-        verdict = search(settings(), out, storage, stages, scheduler, workers)
+        verdict = search(settings(), out, storage, stages, remote, workers)
     print_verdict(verdict, Terminal())
     typer.echo(f"{out}")

@@ -1,27 +1,16 @@
-"""Runs a campaign to its end: hands out what is not computed yet, keeps what comes back.
+"""Runs a campaign to its end: hands out what is not computed yet, keeps what comes back."""
 
-Workers are processes of this machine, or those that a scheduler elsewhere has. Dask pickles what it
-sends, so the scheduler and its workers must be trusted. Our own tasks are plain data. TLS is
-Dask's: an address ``tls://…`` and its configuration for the certificates.
-"""
-
-import logging
-import os
 import time
-import warnings
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
 from itertools import islice
 from pathlib import Path
 from typing import Any, Final
 
-import dask
 from distributed import Client, Future, as_completed
 from distributed.scheduler import KilledWorker
 from rich import progress
 from rich.console import Console
 
-from bayesrace.errors import InputError
 from bayesrace.files import write_whole
 from bayesrace.processes import raise_if_interrupted
 from bayesrace.studies.campaign.case import (
@@ -33,29 +22,28 @@ from bayesrace.studies.campaign.case import (
     run_case,
     software_identity,
 )
+from bayesrace.studies.campaign.cluster import CampaignError, Remote, connected
 from bayesrace.studies.campaign.plan import Campaign
 from bayesrace.studies.campaign.results import writing
 from bayesrace.vehicles import write_car
 
-__all__ = ["run_campaign", "CampaignError", "computed", "connected", "rows_of", "run_worker"]
+__all__ = ["run_campaign", "computed", "rows_of"]
 
 _LINE_S: Final = 10.0  # between two lines of progress where there is no terminal
 _PENDING: Final = 1000  # cases that the scheduler has at once
 
-_DASK: Final[dict[str, Any]] = {
-    # A case that was on a worker when it died is not to blame, unless that happens often.
-    "distributed.scheduler.allowed-failures": 5,
-    "distributed.admin.tick.limit": "1h",  # a worker that computes in C is not stuck
-    "distributed.diagnostics.nvml": False,
-}
-
 
 def run_campaign(
-    campaign: Campaign, out: Path, console: Console, where: str | None, workers: int, again: bool
+    campaign: Campaign,
+    out: Path,
+    console: Console,
+    remote: Remote | None,
+    workers: int,
+    again: bool,
 ) -> str:
     """Computes the cases that ``out`` has no results of; ``again``: those that failed, too.
 
-    ``where``: the scheduler. Returns how many laps were computed now, and how many cases failed.
+    ``remote``: the scheduler. Returns how many laps were computed now, and how many cases failed.
     Raises InputError if there is no scheduler, CampaignError if the workers are lost, and
     KeyboardInterrupt on Ctrl-C; what was computed is kept in every case.
     """
@@ -73,8 +61,9 @@ def run_campaign(
             return "0 laps"
         cases = laps = failed = 0
         begun_s, said_s = time.monotonic(), 0.0
-        with connected(where, workers) as client, _bar(console) as bar:
-            console.print(f"live: {client.dashboard_link}", highlight=False, soft_wrap=True)
+        with connected(remote, workers) as client, _bar(console) as bar:
+            if remote is None:  # another machine's can be reached there alone
+                console.print(f"live: {client.dashboard_link}", highlight=False, soft_wrap=True)
             task = bar.add_task("", total=len(left), note="")
             for batch in computed(client, left.items(), campaign.files):
                 results.add([left[key].columns | row for key, own in batch for row in own])
@@ -100,55 +89,6 @@ def _bar(console: Console) -> progress.Progress:
         "[dim]{task.fields[note]}", console=console, speed_estimate_period=300,
         disable=not console.is_terminal,
     )  # fmt: skip
-
-
-class CampaignError(RuntimeError):
-    """The workers cannot go on; the message says why. What was computed is kept."""
-
-
-@contextmanager
-def connected(scheduler: str | None, workers: int) -> Iterator[Client]:
-    """A client of the scheduler, or of ``workers`` processes of this machine (0: one a core), on
-    loopback, which end with this process, however it ends.
-
-    Raises InputError if there is no scheduler, or no worker of it within a minute.
-    """
-    for name in ("distributed", "distributed.client", "bokeh"):
-        logging.getLogger(name).setLevel(logging.CRITICAL)
-    where: dict[str, Any] = {"address": scheduler, "timeout": 10}
-    if scheduler is None:
-        where = {
-            "n_workers": workers or _cores(), "threads_per_worker": 1, "host": "127.0.0.1",
-            "dashboard_address": "127.0.0.1:8787", "silence_logs": logging.CRITICAL,
-        }  # fmt: skip
-    with dask.config.set(_DASK), warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "Port 8787 is already in use")  # another one serves
-        try:
-            client = Client(**where)
-        except (OSError, RuntimeError, TypeError, ValueError) as error:
-            if scheduler is None:
-                raise CampaignError(f"the workers could not be started: {error}") from None
-            remedy = "start one by 'dask scheduler', and name its address as it prints it"
-            raise InputError(f"no scheduler at {scheduler}: {error}; {remedy}") from None
-        with client:
-            try:
-                client.wait_for_workers(1, timeout=60)
-            except TimeoutError:
-                remedy = f"start some by 'bayesrace campaign-worker {scheduler}'"
-                raise InputError(f"the scheduler at {scheduler} has no worker; {remedy}") from None
-            yield client
-
-
-def _cores() -> int:
-    return len(os.sched_getaffinity(0))
-
-
-def run_worker(scheduler: str, workers: int) -> None:
-    """Serves a scheduler with this many processes (0: one a core) until it ends."""
-    from distributed.cli.dask_worker import main
-
-    options = ["--nworkers", str(workers or _cores()), "--nthreads", "1", "--death-timeout", "60"]
-    main([scheduler, *options], standalone_mode=False)
 
 
 def computed(

@@ -22,8 +22,9 @@ from bayesrace.errors import InputError
 from bayesrace.operation.preparation import prepare
 from bayesrace.operation.settings import RaceSettings
 from bayesrace.operation.terminal.terminal import Stages, plain_table
-from bayesrace.studies.campaign.campaign import computed, connected
+from bayesrace.studies.campaign.campaign import computed
 from bayesrace.studies.campaign.case import FAILED, Case, Controller, Files, Row
+from bayesrace.studies.campaign.cluster import Remote, connected
 from bayesrace.studies.settings import TuneSettings
 from bayesrace.vehicles import CarParameters, write_car
 
@@ -54,11 +55,16 @@ class Verdict(NamedTuple):
 
 
 def tune(
-    settings: TuneSettings, out: Path, file: Path, stages: Stages, where: str | None, workers: int
+    settings: TuneSettings,
+    out: Path,
+    file: Path,
+    stages: Stages,
+    remote: Remote | None,
+    workers: int,
 ) -> Verdict:
     """Searches, judges, and writes the car with what was found to ``out``.
 
-    ``file``: SQLite of the study; a study that is there goes on. ``where``: the scheduler. Raises
+    ``file``: SQLite of the study; a study that is there goes on. ``remote``: the scheduler. Raises
     InputError for tracks that are in both sets, or where a run of the defaults fails.
     """
     if both := sorted({*settings.track} & {*settings.held_out}):
@@ -68,7 +74,7 @@ def tune(
     prepared = prepare(first, (first.track,), stages)
     files = Files()
     weights = files.add(prepared.weights, "the weights")
-    with connected(where, workers) as client:
+    with connected(remote, workers) as client:
         with stages.stage("tune") as stage:
             study, default = _study(settings, file), None
             while (known := _finished(study)) < settings.trials:
