@@ -15,6 +15,7 @@ from typing import Any
 from unittest.mock import MagicMock
 
 import pytest
+import zenoh
 
 from bayesrace.defaults import MAX_WEIGHTS_BYTES
 from bayesrace.errors import InputError
@@ -83,6 +84,10 @@ def take(inbox: Inbox, kind: Kind, timeout_s: float = 5.0) -> Item:
         if item is not None and item.kind is kind:
             return item
     raise AssertionError(f"no {kind} within {timeout_s} s")
+
+
+def _queues(inbox: Inbox, count: int) -> bool:
+    return inbox.queued == count
 
 
 def meet(one: Inbox, two: Inbox) -> None:
@@ -260,7 +265,11 @@ def test_requests_for_the_status_share_one_place_and_one_answer(pair: tuple[Any,
     meet(server, client)
     key = car_key(STATUS.key, "orca", "plant")
     request = encode(StatusRequest(seq=0, source_time_ns=0))
-    waiting = [pair[1].get(key, payload=request, timeout=10.0) for _ in range(100)]
+    block = zenoh.CongestionControl.BLOCK
+    waiting = [
+        pair[1].get(key, payload=request, timeout=10.0, congestion_control=block)
+        for _ in range(100)
+    ]
     until(lambda: server.requests_rejected == 84, "more than may share an answer")
     shared = take(server, Kind.REQUEST).value
     later = pair[1].get(key, payload=request, timeout=10.0)
@@ -271,23 +280,30 @@ def test_requests_for_the_status_share_one_place_and_one_answer(pair: tuple[Any,
     assert sum(one.ok is not None for answers in waiting for one in answers) == 16
 
 
-def test_a_stop_is_taken_before_requests_that_wait_for_longer(pair: tuple[Any, Any]) -> None:
+def test_a_run_and_its_stop_are_taken_before_requests_that_wait_for_longer(
+    pair: tuple[Any, Any],
+) -> None:
     server, client = Inbox(pair[0], "orca"), Inbox(pair[1], "orca")
-    for service in (RUN, STOP):
+    services: tuple[Service[Any, Any], ...] = ROLLBACK, RUN, STOP
+    for service in services:
         server.serve(service)
     meet(server, client)
-    runs = [pair[1].get(car_key(RUN.key, "orca"), timeout=10.0) for _ in range(20)]
+    block = zenoh.CongestionControl.BLOCK
+    key = car_key(ROLLBACK.key, "orca")
+    others = [pair[1].get(key, timeout=10.0, congestion_control=block) for _ in range(20)]
     until(lambda: server.requests_rejected == 4, "all places of other requests to be taken")
-    stop = pair[1].get(car_key(STOP.key, "orca"), timeout=10.0)
-    until(lambda: server.queued == 17, "the stop")
+    urgent = []
+    for number, service in enumerate(services[1:], 17):
+        urgent.append(pair[1].get(car_key(service.key, "orca"), timeout=10.0))
+        until(partial(_queues, server, number), service.name)
     names = []
-    for _ in range(17):
+    for _ in range(18):
         item = take(server, Kind.REQUEST)
         names.append(item.name)
         item.value.answer(messages.reply(True))
-    assert names == ["stop"] + 16 * ["run"]
-    assert len(list(stop)) == 1
-    assert sum(one.ok is not None for answers in runs for one in answers) == 16
+    assert names == ["run", "stop"] + 16 * ["rollback"]
+    assert all(len(list(one)) == 1 for one in urgent)
+    assert sum(one.ok is not None for answers in others for one in answers) == 16
 
 
 def test_a_lost_request_is_repeated_but_for_a_rollback(pair: tuple[Any, Any]) -> None:

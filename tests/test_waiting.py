@@ -77,6 +77,16 @@ def test_an_endpoint_in_use_is_waited_for(tmp_path: Path, course: Course, name: 
     assert "choose another endpoint" in said
 
 
+def test_a_unix_socket_in_use_is_waited_for(tmp_path: Path, course: Course) -> None:
+    line = command("plant", course, f"unixsock-stream/{tmp_path / 'plant'}")
+    with Program(tmp_path / "first.txt", *line) as first:
+        until(lambda: RUNNING["plant"] in first.said(), "the first plant")
+        with Program(tmp_path / "second.txt", *line) as second:
+            until(lambda: "acquire lock" in second.said(), "a line about the endpoint")
+            first.end()
+            check_running(second, "plant")
+
+
 @pytest.mark.parametrize("name", SERVICES)
 def test_a_process_that_waits_for_an_endpoint_can_be_ended(
     tmp_path: Path, course: Course, name: Role

@@ -144,8 +144,10 @@ TOPICS: Final[tuple[Topic[Any], ...]] = (
 )  # fmt: skip
 
 RUN: Final = Service(
-    "run", "bayesrace/{car}/plant/run", RunRequest, Reply, ("plant",), ("director",), 20.0, False
-)
+    "run", "bayesrace/{car}/plant/run", RunRequest, Reply, ("plant",), ("director",), 20.0, False,
+    urgent=True,
+)  # fmt: skip
+"""Urgent as its stop is, which must not overtake it."""
 STOP: Final = Service(
     "stop", "bayesrace/{car}/plant/stop", StopRequest, Reply, ("plant",), ("director",), 5.0, False,
     urgent=True,

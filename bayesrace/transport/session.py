@@ -285,7 +285,9 @@ def _not_opened(endpoints: Endpoints, error: Exception) -> InputError:
     """Why a session could not be opened; TransientError if that may pass."""
     text = re.sub(r" at /\S+", "", str(error).splitlines()[0])  # places in Zenoh's source
     cause = re.search(r"[^:\[]+ \(os error (\d+)\)", text)
-    passes = int(cause[1]) in _PASSING if cause else "lookup" in text  # of a host name
+    # Without a number: of a host's name, and of a Unix socket in use.
+    known = "lookup" in text or "acquire lock" in text
+    passes = int(cause[1]) in _PASSING if cause else known
     return (TransientError if passes else InputError)(
         f"cannot listen on {', '.join(endpoints.listen) or 'no endpoint'}: "
         f"{(cause[0] if cause else text[:300]).strip()}; "

@@ -2,7 +2,7 @@
 
     python -m tests.security.flood ENDPOINT FOLDER SOURCE RATE
 
-It prints "asking" when it begins, and on the end of stdin how many times it has asked.
+It prints "asking" when it begins, and on the end of stdin how many times a second it has asked.
 """
 
 import select
@@ -32,7 +32,7 @@ def main(endpoint: str, folder: str, source: str, rate: str) -> None:
             for _ in range(int((time.monotonic() - begin) * int(rate)) - sent):
                 session.get(key, lambda _: None, payload=request, timeout=_TIMEOUT_S)
                 sent += 1
-        print(sent, flush=True)  # noqa: T201
+        print(sent / (time.monotonic() - begin), flush=True)  # noqa: T201
 
 
 if __name__ == "__main__":

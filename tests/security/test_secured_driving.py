@@ -156,8 +156,8 @@ def test_forged_messages_reach_nobody_and_the_car_stays_on_the_track(
 
 
 @contextmanager
-def asking(rig: Rig, endpoint: str, source: str, rate: int, least: int) -> Iterator[None]:
-    """For the block, a viewer asks for the status of a process; at ``least`` so often."""
+def asking(rig: Rig, endpoint: str, source: str, rate: int) -> Iterator[None]:
+    """For the block, a viewer asks for the status of a process, about so often a second."""
     flood = subprocess.Popen(
         [
             sys.executable, "-m", "tests.security.flood", endpoint, rig.bundles.path("viewer"),
@@ -171,7 +171,7 @@ def asking(rig: Rig, endpoint: str, source: str, rate: int, least: int) -> Itera
         yield
     finally:
         out, _ = flood.communicate("", timeout=PATIENCE_S)
-    assert int(out) >= least
+    assert float(out) > 0.5 * rate
 
 
 @pytest.mark.check
@@ -192,7 +192,7 @@ def test_each_stop_gets_through_while_viewers_ask_for_the_status_without_end(
             (controller, "controller"),
             (controller, "controller"),
         ):
-            stack.enter_context(asking(rig, where, source, rate, least=2 * rate))
+            stack.enter_context(asking(rig, where, source, rate))
         time.sleep(1.0)
         took_s = []
         for _ in range(20):
