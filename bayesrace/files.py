@@ -25,7 +25,6 @@ __all__ = [
     "read_whole",
     "replacing",
     "temporary_folder",
-    "write_private",
     "write_whole",
 ]
 
@@ -108,16 +107,14 @@ def replacing(path: Path) -> Iterator[Path]:
         _sync(path.parent)
 
 
-def write_whole(path: Path, data: str | bytes) -> None:
-    """The content of a file, text in UTF-8; see :func:`replacing`."""
-    with replacing(path) as partial:
-        partial.write_bytes(data.encode() if isinstance(data, str) else data)
+def write_whole(path: Path, data: str | bytes, *, private: bool = False) -> None:
+    """The content of a file, text in UTF-8; see :func:`replacing`.
 
-
-def write_private(path: Path, data: str | bytes) -> None:
-    """The same, at no moment readable by others."""
+    ``private``: others can read it at no moment.
+    """
     with replacing(path) as partial:
-        partial.touch(0o600, exist_ok=False)
+        if private:
+            partial.touch(0o600, exist_ok=False)
         partial.write_bytes(data.encode() if isinstance(data, str) else data)
 
 

@@ -27,7 +27,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from bayesrace.errors import InputError, faults_in
-from bayesrace.files import claimed, read_text, write_private, write_whole
+from bayesrace.files import claimed, read_text, write_whole
 from bayesrace.messages import Role, is_car_name
 from bayesrace.transport.credentials import (
     AUTHORITY,
@@ -252,4 +252,5 @@ def _alternatives(hosts: Sequence[str]) -> x509.SubjectAlternativeName:
 
 
 def _write_private(path: Path, key: ec.EllipticCurvePrivateKey) -> None:
-    write_private(path, key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption()))
+    data = key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())
+    write_whole(path, data, private=True)

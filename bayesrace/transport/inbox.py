@@ -158,8 +158,8 @@ class Inbox:
     def serve(self, service: Service[Any, Any], source: str = "") -> None:
         """Receive the service's requests; those beyond the limit are rejected and counted.
 
-        Whoever may only look on cannot use up the places of others: requests of a ``shared``
-        service have one, and ``urgent`` ones are taken first.
+        Viewers may send requests of ``shared`` services alone. Those share one place, so they
+        cannot use up the places of others. Requests of ``urgent`` services are taken first.
         """
 
         def on_request(request: Request) -> None:
@@ -291,7 +291,7 @@ class Inbox:
         return True
 
     def _next_request(self) -> Item:
-        """In place of the one that the queue has given; nobody joins it from now on."""
+        """The request to serve now, an urgent one first; later ones do not share its answer."""
         with self._lock:
             item = (self._urgent or self._others).popleft()
             self._shared.pop(item.name, None)

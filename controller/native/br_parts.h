@@ -1,8 +1,8 @@
 /* The step but the generated model, once more, by br_avx2.c and br_avx512.c.
  *
  * The step is compiled for several instruction sets, of which the processor's best is chosen at
- * run time. Each of its files, those below, is compiled as it is, for whatever the compiler is told
- * to compile for (any x86-64, say). On x86-64, br_avx2.c and br_avx512.c include all of them once
+ * run time. Each of the files below is compiled by itself, for the processor that the compiler's
+ * options name (any x86-64, say). On x86-64, br_avx2.c and br_avx512.c include all of them once
  * more, each with its own instructions and vectors of its own length; there everything is static
  * but the table of functions. What is stored in a br_mpc is the same for all, so code may be
  * exchanged between two calls. Results differ by rounding. */

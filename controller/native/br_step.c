@@ -319,7 +319,7 @@ static double iteration_and_rest(const br_timer *timer) {
     return 2 * timer->iteration + timer->caution;
 }
 
-/* The next problem as far as it can be told: from the state that the plan predicts after so many
+/* Predicts the next problem: from the state that the plan predicts after so many
  * shifts, with the input before it and the line's reference there. Without a shift, the last one.
  */
 static void foresee(br_mpc *mpc, double elapsed, int shifts) {

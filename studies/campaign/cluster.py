@@ -19,7 +19,7 @@ import dask
 from distributed import Client, Security
 
 from bayesrace.errors import InputError
-from bayesrace.files import read_whole, temporary_folder, write_private
+from bayesrace.files import read_whole, temporary_folder, write_whole
 from bayesrace.transport.credentials import check_private
 
 __all__ = ["CampaignError", "Remote", "connected", "run_scheduler", "run_worker"]
@@ -153,7 +153,7 @@ def run_scheduler(address: str, key: Path) -> None:
     if not key.exists():
         import_module("cryptography")  # as above
         made = Security.temporary()
-        write_private(key, made.tls_client_key + made.tls_client_cert)
+        write_whole(key, made.tls_client_key + made.tls_client_cert, private=True)
     options = Remote.checked(address, key).options
     with _configured():
         try:

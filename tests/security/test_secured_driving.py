@@ -71,24 +71,29 @@ def test_a_secured_system_is_driven_taught_and_commanded(
 
 
 @contextmanager
+def attacking(module: str, begins: str, *words: str | Path | int) -> Iterator[list[str]]:
+    """For the block, that program runs; it prints ``begins``, and at its end what is then given."""
+    attacker = subprocess.Popen(
+        [sys.executable, "-m", f"tests.security.{module}", *map(str, words)],
+        cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    assert attacker.stdout is not None
+    assert attacker.stdout.readline() == f"{begins}\n"
+    said: list[str] = []
+    try:
+        yield said
+    finally:
+        said += attacker.communicate("", timeout=PATIENCE_S)[0].split()
+
+
+@contextmanager
 def forging(rig: Rig, name: str, rate: int, connections: int = 0, least: int = 0) -> Iterator[None]:
     """For the block, a program with that certificate forges messages; ``least``: so many."""
     status = rig.director.status("plant")
-    forger = subprocess.Popen(
-        [
-            sys.executable, "-m", "tests.security.forger", rig.plant_at,
-            rig.bundles.path(name), str(rate), str(connections), CAR, str(status.epoch),
-            str(status.run),
-        ],
-        cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
-    )  # fmt: skip
-    assert forger.stdout is not None
-    assert forger.stdout.readline() == "forging\n"
-    try:
+    words = rig.plant_at, rig.bundles.path(name), rate, connections, CAR, status.epoch, status.run
+    with attacking("forger", "forging", *words) as said:
         yield
-    finally:
-        out, _ = forger.communicate("", timeout=PATIENCE_S)
-    assert int(out.split()[0]) >= least
+    assert int(said[0]) >= least
 
 
 UNTOUCHED = {
@@ -158,20 +163,9 @@ def test_forged_messages_reach_nobody_and_the_car_stays_on_the_track(
 @contextmanager
 def asking(rig: Rig, endpoint: str, source: str, rate: int) -> Iterator[None]:
     """For the block, a viewer asks for the status of a process, about so often a second."""
-    flood = subprocess.Popen(
-        [
-            sys.executable, "-m", "tests.security.flood", endpoint, rig.bundles.path("viewer"),
-            source, str(rate),
-        ],
-        cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
-    )  # fmt: skip
-    assert flood.stdout is not None
-    assert flood.stdout.readline() == "asking\n"
-    try:
+    with attacking("flood", "asking", endpoint, rig.bundles.path("viewer"), source, rate) as said:
         yield
-    finally:
-        out, _ = flood.communicate("", timeout=PATIENCE_S)
-    assert float(out) > min(0.5 * rate, 100)  # how many more depends on the machine
+    assert float(said[0]) > min(0.5 * rate, 100)  # how many more depends on the machine
 
 
 @pytest.mark.check
