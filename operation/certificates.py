@@ -8,6 +8,7 @@ to drive; who has the former can make himself a director.
 import ipaddress
 import os
 import re
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta
@@ -63,6 +64,7 @@ class Entry(Member):
 class _Register(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
+    number: int = Field(0, description="of the list of members made of it")
     entries: dict[str, Entry] = {}
 
 
@@ -83,7 +85,7 @@ def init(folder: Path) -> None:
     _write_private(authority / KEY, key)
     certificate = builder.sign(key, hashes.SHA256())
     write_whole(authority / AUTHORITY, certificate.public_bytes(Encoding.PEM))
-    _write_register(folder, {})
+    _write_register(folder, _Register(), key)
 
 
 def add(
@@ -99,8 +101,8 @@ def add(
 
     ``car``: the one that it is for, None: all. What is not given when renewing stays.
     """
-    with _changing(folder) as entries:
-        before = entries.get(name)
+    with _changing(folder) as (register, signs):
+        before = register.entries.get(name)
         _check_name(name, before, renew)
         if before is not None:
             role, car, hosts = role or before.role, car or before.car, hosts or before.hosts
@@ -112,44 +114,60 @@ def add(
         target = folder / name
         target.mkdir(mode=0o700, exist_ok=True)
         key = ec.generate_private_key(ec.SECP256R1())
-        certificate = _signed(folder, name, role, hosts, key.public_key(), ends)
+        certificate = _signed(folder, signs, name, role, hosts, key.public_key(), ends)
         _write_private(target / KEY, key)
         write_whole(target / CERTIFICATE, certificate)
         write_whole(target / AUTHORITY, (folder / _FOLDER / AUTHORITY).read_bytes())
         # That of the authority, if it ends before.
         ends = x509.load_pem_x509_certificate(certificate).not_valid_after_utc
         entry = Entry(role=role, car=car or EVERY_CAR, hosts=tuple(hosts), ends=ends)
-        _write_register(folder, {**entries, name: entry})
+        _write_register(folder, _with(register, name, entry), signs)
         return target
 
 
 def revoke(folder: Path, name: str) -> None:
     """Take a name off the list of members, for ever; InputError if it is not on it."""
-    with _changing(folder) as entries:
-        if name not in entries:
-            known = ", ".join(sorted(entries)) or "none"
+    with _changing(folder) as (register, signs):
+        if (entry := register.entries.get(name)) is None:
+            known = ", ".join(sorted(register.entries)) or "none"
             raise InputError(f"no certificate '{name}' in {folder}; there are: {known}")
-        revoked = entries[name].model_copy(update={"revoked": True})
-        _write_register(folder, {**entries, name: revoked})
+        revoked = entry.model_copy(update={"revoked": True})
+        _write_register(folder, _with(register, name, revoked), signs)
 
 
 def read_register(folder: Path) -> dict[str, Entry]:
     """Every certificate that was made, by name; InputError where there is no authority."""
+    return dict(_read(folder).entries)
+
+
+def _read(folder: Path) -> _Register:
     path = folder / _FOLDER / _REGISTER
     remedy = "make an authority with 'bayesrace certs init', or name its folder with --folder"
     text = read_text(path, "register of certificates", remedy)
     try:
-        return dict(_Register.model_validate_json(text).entries)
+        return _Register.model_validate_json(text)
     except ValidationError as error:
         raise InputError(f"{path}: {faults_in(error)}") from None
 
 
 @contextmanager
-def _changing(folder: Path) -> Iterator[dict[str, Entry]]:
-    """The register, which no other process changes within the block."""
-    read_register(folder)  # there is one
+def _changing(folder: Path) -> Iterator[tuple[_Register, ec.EllipticCurvePrivateKey]]:
+    """The register, which no other process changes within the block, and the key that signs."""
+    _read(folder)  # there is one
     with claimed(folder / _FOLDER):
-        yield read_register(folder)
+        yield _read(folder), _signing_key(folder)
+
+
+def _signing_key(folder: Path) -> ec.EllipticCurvePrivateKey:
+    path = folder / _FOLDER / KEY
+    key = load_pem_private_key(path.read_bytes(), None)
+    if not isinstance(key, ec.EllipticCurvePrivateKey):
+        raise InputError(f"{path} is no key of 'bayesrace certs init'")
+    return key
+
+
+def _with(register: _Register, name: str, entry: Entry) -> _Register:
+    return register.model_copy(update={"entries": {**register.entries, name: entry}})
 
 
 def _check_name(name: str, before: Entry | None, renew: bool) -> None:
@@ -163,15 +181,21 @@ def _check_name(name: str, before: Entry | None, renew: bool) -> None:
         raise InputError(f"there is a certificate '{name}': choose another name, or --renew it")
 
 
-def _write_register(folder: Path, entries: dict[str, Entry]) -> None:
-    """The register, and the list of members in the folder of each certificate."""
-    register = _Register(entries=entries)
+def _write_register(folder: Path, register: _Register, signs: ec.EllipticCurvePrivateKey) -> None:
+    """The register, and the next list of members in the folder of each certificate."""
+    # By the clock, so that it grows where an older copy of the authority's folder is in use, too.
+    number = max(register.number + 1, int(time.time()))
+    register = register.model_copy(update={"number": number})
     write_whole(folder / _FOLDER / _REGISTER, register.model_dump_json(indent=1) + "\n")
+    entries = register.entries
     valid = {name: one for name, one in entries.items() if not one.revoked}
     members = Members(
+        number=number,
         members={name: Member(role=one.role, car=one.car) for name, one in valid.items()},
         revoked=tuple(sorted(entries.keys() - valid.keys())),
     )
+    signature = signs.sign(members.content(), ec.ECDSA(hashes.SHA256()))
+    members = members.model_copy(update={"signature": signature.hex()})
     for name in entries:
         if (folder / name).is_dir():
             write_whole(folder / name / MEMBERS, members.model_dump_json(indent=1) + "\n")
@@ -179,17 +203,14 @@ def _write_register(folder: Path, entries: dict[str, Entry]) -> None:
 
 def _signed(
     folder: Path,
+    signs: ec.EllipticCurvePrivateKey,
     name: str,
     role: Role,
     hosts: Sequence[str],
     key: ec.EllipticCurvePublicKey,
     ends: datetime,
 ) -> bytes:
-    authority = folder / _FOLDER
-    signs = load_pem_private_key((authority / KEY).read_bytes(), None)
-    if not isinstance(signs, ec.EllipticCurvePrivateKey):
-        raise InputError(f"{authority / KEY} is no key of 'bayesrace certs init'")
-    issuer = x509.load_pem_x509_certificate((authority / AUTHORITY).read_bytes())
+    issuer = x509.load_pem_x509_certificate((folder / _FOLDER / AUTHORITY).read_bytes())
     purposes = [ExtendedKeyUsageOID.CLIENT_AUTH]
     if role in _LISTENERS:
         purposes.append(ExtendedKeyUsageOID.SERVER_AUTH)

@@ -18,7 +18,7 @@ from tests.car_fmu import packed_car
 from tests.command_line import Cli, refused
 from tests.programs import ROOT, peanut
 
-NEEDED = {"cffi", "eclipse-zenoh", "msgpack", "numpy", "pydantic", "typer"}
+NEEDED = {"cffi", "cryptography", "eclipse-zenoh", "msgpack", "numpy", "pydantic", "typer"}
 NOT_NEEDED = {"casadi", "fmpy", "jinja2", "matplotlib", "mcap", "scipy"}
 
 
@@ -53,7 +53,6 @@ def test_the_controller_drives_with_its_own_extra_alone(
     [
         ("studies.campaign.report studies.campaign.results", "pandas",
          "campaign-report .", "campaign"),
-        ("operation.certificates", "cryptography", "certs init", "certificates"),
         ("plant.fmu", "fmpy", "fmu inspect FMU", "fmu"),
     ],
 )  # fmt: skip

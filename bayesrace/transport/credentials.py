@@ -2,7 +2,8 @@
 
 A folder holds what one process needs, as ``bayesrace certs`` writes it: the authority's certificate
 (``ca.pem``), its own (``certificate.pem``) with the private key (``key.pem``), and
-``members.json``, which says what each name may do. A name that is not in it may do nothing.
+``members.json``, which says what each name may do. A name that is not in it may do nothing. The
+authority has signed and numbered that list; one with a lower number than the last is refused.
 """
 
 import logging
@@ -19,7 +20,7 @@ from typing import TYPE_CHECKING, Final, Self
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from bayesrace.errors import InputError, TransientError, faults_in
-from bayesrace.files import read_text
+from bayesrace.files import read_text, write_whole
 from bayesrace.messages import Role
 
 if TYPE_CHECKING:
@@ -37,6 +38,8 @@ AUTHORITY: Final = "ca.pem"
 CERTIFICATE: Final = "certificate.pem"
 KEY: Final = "key.pem"
 MEMBERS: Final = "members.json"
+_SEEN: Final = "members.seen"
+"""The highest number of a list that was read here."""
 
 NEWEST_LIST: Final = (
     f"give every process the newest {MEMBERS} of 'bayesrace certs', and start it again"
@@ -88,8 +91,22 @@ class Members(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
+    number: int = Field(0, description="higher than those of all lists before")
     members: dict[str, Member] = Field({}, description="by the name in the certificate")
     revoked: tuple[str, ...] = Field((), description="names that never count again")
+    signature: str = Field("", description="of the authority, over all else (ECDSA), in hex")
+
+    def content(self) -> bytes:
+        """What the authority signs."""
+        return self.model_dump_json(exclude={"signature"}).encode()
+
+    def check_newer(self, seen: int, path: Path) -> None:
+        """InputError if a list with a higher number has been seen; ``path``: of its file."""
+        if self.number < seen:
+            raise InputError(
+                f"{path} has number {self.number}, and {seen} has been in use here: an old list "
+                "would let in who was revoked; copy the newest one"
+            )
 
 
 class Credentials(BaseModel):
@@ -116,7 +133,7 @@ class Credentials(BaseModel):
             read_text(folder / name, "file", _COPY)
         check_private(folder / KEY)
         name, ends_s = _verified(folder)
-        return cls(folder=folder, name=name, ends_s=ends_s, members=_members(folder / MEMBERS))
+        return cls(folder=folder, name=name, ends_s=ends_s, members=_members(folder))
 
     def client(self) -> "ssl.SSLContext":
         """For a link to another end, whose certificate is checked."""
@@ -229,13 +246,44 @@ def _outlasted(credentials: Credentials, over: threading.Event) -> bool:
     return True
 
 
-def _members(path: Path) -> Members:
-    """The members in a file; InputError if it cannot be used."""
+def _members(folder: Path) -> Members:
+    """The list of members, signed and as new as any before; InputError if it cannot be used."""
+    path, seen_path = folder / MEMBERS, folder / _SEEN
     text = read_text(path, "list of members", "copy it from where 'bayesrace certs' wrote it")
     try:
-        return Members.model_validate_json(text)
+        members = Members.model_validate_json(text)
     except ValidationError as error:
         raise InputError(f"{path}: {faults_in(error)}; copy it again") from None
+    _check_signature(members, folder)
+    seen = 0
+    with suppress(OSError, ValueError):
+        seen = int(seen_path.read_bytes())
+    members.check_newer(seen, path)
+    if members.number > seen:
+        with suppress(OSError):  # read-only: then a running process alone remembers
+            write_whole(seen_path, str(members.number))
+    return members
+
+
+def _check_signature(members: Members, folder: Path) -> None:
+    # 19 MB, which a process without certificates does not need.
+    from cryptography import x509
+    from cryptography.exceptions import InvalidSignature
+    from cryptography.hazmat.primitives import hashes
+    from cryptography.hazmat.primitives.asymmetric import ec
+
+    key = x509.load_pem_x509_certificate((folder / AUTHORITY).read_bytes()).public_key()
+    try:
+        if not isinstance(key, ec.EllipticCurvePublicKey):
+            raise InvalidSignature
+        signature = bytes.fromhex(members.signature)
+        key.verify(signature, members.content(), ec.ECDSA(hashes.SHA256()))
+    except (InvalidSignature, ValueError):
+        raise InputError(
+            f"{folder / MEMBERS} is not signed by the authority in {AUTHORITY}: copy it from where "
+            "'bayesrace certs' wrote it; if that is from before lists were signed, 'bayesrace "
+            "certs add NAME --renew' for any name writes it again"
+        ) from None
 
 
 def check_private(key: Path) -> None:

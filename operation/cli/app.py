@@ -34,7 +34,6 @@ _EXTRAS: Final = {
     ),
     "campaign": ("bokeh", "dask", "distributed", "optuna", "pandas", "pyarrow"),
     "slipx": ("slipx",),
-    "certificates": ("cryptography",),
 }  # fmt: skip
 """Modules that the extras of pyproject.toml install."""
 

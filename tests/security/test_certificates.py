@@ -1,5 +1,6 @@
 """Making, listing and revoking certificates, and what is said of those that can't be used."""
 
+import re
 import shutil
 import stat
 from collections.abc import Callable
@@ -128,6 +129,17 @@ def _spoilt_list(folder: Path) -> None:
     (folder / "members.json").write_text('{"members": {"plant": {"role": "king"}}}')
 
 
+def _another_role(folder: Path) -> None:
+    text = (folder / "members.json").read_text()
+    assert '"role":"viewer"' in text.replace(" ", "")
+    (folder / "members.json").write_text(text.replace('"viewer"', '"director"'))
+
+
+def _unsigned(folder: Path) -> None:
+    text = (folder / "members.json").read_text()
+    (folder / "members.json").write_text(re.sub(r',\s*"signature": "\w+"', "", text))
+
+
 def _of(name: str, *files: str) -> Callable[[Path, Bundles], None]:
     def take(folder: Path, bundles: Bundles) -> None:
         for file in files:
@@ -142,6 +154,9 @@ def _of(name: str, *files: str) -> Callable[[Path, Bundles], None]:
         (lambda folder, _: _readable(folder), "others can read .*chmod 600"),
         (lambda folder, _: _without_list(folder), "members.json.*copy the folder again"),
         (lambda folder, _: _spoilt_list(folder), "members.plant.role"),
+        (lambda folder, _: _another_role(folder), "not signed by the authority.*copy it"),
+        (lambda folder, _: _unsigned(folder), "not signed by the authority.*add NAME --renew"),
+        (_of("foreign-plant", "members.json"), "not signed by the authority"),
         (_of("controller", "key.pem"), "do not fit"),
         (_of("foreign-plant", "certificate.pem", "key.pem"), "not of the authority"),
         (_of("expired", "certificate.pem", "key.pem"), "has expired: renew"),
@@ -156,6 +171,22 @@ def test_a_folder_that_cannot_be_used_is_refused_with_the_remedy(
     spoil(folder, bundles)
     with pytest.raises(InputError, match=words):
         Credentials.read(folder)
+
+
+def test_a_list_with_a_lower_number_than_the_last_one_is_refused(tmp_path: Path) -> None:
+    """Who was revoked could bring back the list that he was in. Read-only folders forget it."""
+    certificates.init(tmp_path)
+    folder = certificates.add(tmp_path, "plant", "plant")
+    certificates.add(tmp_path, "boss", "director")
+    older = (folder / "members.json").read_bytes()
+    certificates.revoke(tmp_path, "boss")
+    newest = Credentials.read(folder).members
+    (folder / "members.json").write_bytes(older)
+    with pytest.raises(InputError, match=f"members.json has number .*and {newest.number} has been"):
+        Credentials.read(folder)
+    (folder / "members.seen").unlink()
+    (folder / "members.seen").mkdir()
+    assert Credentials.read(folder).members.number < newest.number
 
 
 def test_a_directors_certificate_serves_those_who_may_do_less(bundles: Bundles) -> None:

@@ -1,6 +1,5 @@
 """Without a link every process names the endpoint, and ``doctor`` says why there is none."""
 
-import json
 import shutil
 from pathlib import Path
 from typing import Final
@@ -186,18 +185,15 @@ def test_doctor_says_what_else_may_be_wrong(cli: Cli, bundles: Bundles, tmp_path
     assert "FAULT  others can read the private key" in cli("doctor", "--config", config).out
 
 
-def test_an_older_list_of_members_is_said_by_commands_and_doctor(
-    cli: Cli, bundles: Bundles, tmp_path: Path
-) -> None:
+def test_an_older_list_of_members_is_said_by_commands_and_doctor(cli: Cli, tmp_path: Path) -> None:
     """A plant that does not have this machine's certificate in its list drops every message."""
-    folder = tmp_path / "plant"
-    shutil.copytree(bundles.path("plant"), folder)
-    content = json.loads((folder / "members.json").read_text())
+    certs, folder = tmp_path / "certs", tmp_path / "plant"
+    init(certs)
+    shutil.copytree(add(certs, "plant", "plant", CAR), folder)
     for name in ("director", "viewer"):
-        del content["members"][name]
-    (folder / "members.json").write_text(json.dumps(content))
+        add(certs, name, name)
     where = free_endpoint("tls")
-    config = written(tmp_path, bundles, where, where)
+    config = written(tmp_path, Bundles(certs), where, where)
     older = Endpoints(listen=(where,), credentials=Credentials.read(folder))
     with open_session(older, "plant") as session:
         token = session.liveliness().declare_token(f"bayesrace/{CAR}/alive/plant")
