@@ -211,14 +211,14 @@ def _not_found(session: Any, endpoints: Endpoints, timeout_s: float, name: str) 
     remedy = (
         "start 'bayesrace plant' and 'bayesrace controller', or give their endpoints (--endpoint)"
     )
+    if endpoints.credentials is not None:
+        remedy += f"; if both run, {NEWEST_LIST}"
     if not _connected(session):
         doctor = "'bayesrace doctor' says what is wrong"
         return InputError(f"no connection to {where} within {timeout_s:g} s; {remedy}; {doctor}")
     others = sorted(_tokens(session, ALIVE.format(car="*", source="*"), timeout_s)) if name else []
     if others:
         return InputError(f"no car '{name}' at {where}; cars found: {', '.join(others)}")
-    if endpoints.credentials is not None:
-        remedy += f"; if both run, {NEWEST_LIST}"
     return InputError(f"linked to {where}, but no car is visible there; {remedy}")
 
 

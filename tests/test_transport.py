@@ -55,7 +55,7 @@ from bayesrace.transport import (
     send_weights,
 )
 from bayesrace.transport import inbox as inbox_module
-from bayesrace.transport import session as session_module
+from bayesrace.transport.links import Links
 from bayesrace.transport.session import unlinked, zenoh_config
 from tests import sample_messages as messages
 from tests.command_line import Cli, refused
@@ -377,7 +377,7 @@ def test_a_link_made_with_the_last_descriptor_ends_no_process() -> None:
     before = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (0, before[1]))
     try:
-        session_module._close_without_waiting()
+        Links(None).tend()
     finally:
         resource.setrlimit(resource.RLIMIT_NOFILE, before)
 

@@ -12,10 +12,10 @@ import signal
 import stat
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Self
+from typing import TYPE_CHECKING, Any, Final, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 __all__ = [
     "AUTHORITY", "CERTIFICATE", "CERTIFICATE_EXPIRED", "CERTIFICATE_NOT_YET", "COVERS", "EVERY_CAR",
     "KEY", "MEMBERS", "NEWEST_LIST", "Credentials", "Member", "Members", "check_private",
-    "ending_on_expiry",
+    "watching",
 ]  # fmt: skip
 
 _log = logging.getLogger("bayesrace.links")
@@ -194,11 +194,15 @@ class Credentials(BaseModel):
 
 
 @contextmanager
-def ending_on_expiry(
-    credentials: Credentials, failure: type[InputError] = InputError
+def watching(
+    credentials: Credentials,
+    changed: Callable[[Credentials], None],
+    failure: type[InputError] = InputError,
 ) -> Iterator[None]:
-    """For the block, the expiry of the certificate interrupts the main thread; then the end of the
-    block raises ``failure`` with the reason. Zenoh closes such links, but opens them again.
+    """For the block, calls ``changed`` from a thread with each newer content of the folder.
+
+    The expiry of the certificate interrupts the main thread; then the end of the block raises
+    ``failure`` with the reason. Zenoh closes such links, but opens them again.
 
     Started in another thread, it only logs the reason. The log warns of the expiry each day for two
     weeks before.
@@ -209,7 +213,7 @@ def ending_on_expiry(
     over, expired = threading.Event(), threading.Event()
 
     def watch() -> None:
-        if not _outlasted(credentials, over):
+        if not _outlasted(credentials, over, changed):
             return
         expired.set()
         if not in_main:
@@ -234,16 +238,43 @@ def ending_on_expiry(
         raise failure(credentials.expired())
 
 
-def _outlasted(credentials: Credentials, over: threading.Event) -> bool:
-    """Waits for the expiry; False if it is over before."""
-    remind_s = 0.0
+def _outlasted(
+    credentials: Credentials, over: threading.Event, changed: Callable[[Credentials], None]
+) -> bool:
+    """Waits for the expiry, and looks at the folder meanwhile; False if it is over before."""
+    remind_s, newest, known = 0.0, credentials, tuple[Any, ...]()
     while (left_s := credentials.ends_s - time.time()) > 0:
         if time.monotonic() >= remind_s and (warning := credentials.expires_soon()):
             _log.warning("%s", warning)
             remind_s = time.monotonic() + _REMINDER_S
         if over.wait(min(left_s, _CALENDAR_S)):
             return False
+        if (stamps := _stamps(credentials.folder)) != known:
+            known, before = stamps, newest
+            if (newest := _newer(before)) != before:
+                changed(newest)
     return True
+
+
+def _stamps(folder: Path) -> tuple[Any, ...]:
+    """What differs as soon as a file does."""
+    stamps = []
+    for name in (AUTHORITY, CERTIFICATE, KEY, MEMBERS):
+        with suppress(OSError):
+            status = (folder / name).stat()
+            stamps.append((name, status.st_ino, status.st_ctime_ns))
+    return tuple(stamps)
+
+
+def _newer(before: Credentials) -> Credentials:
+    """The content of the folder now; what it was before if that cannot be used."""
+    try:
+        now = Credentials.read(before.folder)
+        now.members.check_newer(before.members.number, before.folder / MEMBERS)
+    except InputError as error:
+        _log.warning("%s; what was read before stays in use", error)
+        return before
+    return now
 
 
 def _members(folder: Path) -> Members:

@@ -15,13 +15,10 @@ import json
 import logging
 import os
 import re
-import socket
-import struct
 import time
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager, nullcontext
-from pathlib import Path
+from contextlib import ExitStack, contextmanager
 from typing import Any, Final
 
 import zenoh
@@ -46,9 +43,10 @@ from bayesrace.transport.credentials import (
     KEY,
     Credentials,
     Members,
-    ending_on_expiry,
+    watching,
 )
 from bayesrace.transport.endpoints import Endpoints, address_of, check_descriptors, leaves
+from bayesrace.transport.links import Links
 from bayesrace.transport.requests import in_transport_thread
 
 __all__ = ["open_session", "check_session", "access_control", "unlinked", "zenoh_config"]
@@ -202,6 +200,7 @@ def open_session(
     the session then does not wait for them, and the log does not say that they are absent.
     ``reports_absence`` False: nor does it where the caller reports that, after a time limit.
 
+    Links of who is not in the list of members, as it is in the folder at any time, are closed.
     Where the process's certificate expires, the main thread gets a SIGINT, and the end of the block
     raises InputError with the reason: RestartError in a plant, controller or router.
     """
@@ -214,8 +213,10 @@ def open_session(
         )  # fmt: skip
     own = endpoints.credentials
     failure = RestartError if role in _SERVERS else InputError
-    ending = nullcontext() if own is None else ending_on_expiry(own, failure)
-    with _opened(endpoints, role, peers_follow) as session, ending:
+    with ExitStack() as stack:
+        session, links = stack.enter_context(_opened(endpoints, role, peers_follow))
+        if own is not None:
+            stack.enter_context(watching(own, lambda new: links.update(new.members), failure))
         missing: list[str] = []
         if reports_absence and not peers_follow:
             with short_slices():  # Zenoh may start threads for these calls, too
@@ -257,7 +258,7 @@ def _unlinked(session: Any, endpoints: Endpoints) -> list[str]:
 
 
 @contextmanager
-def _opened(endpoints: Endpoints, role: Role, peers_follow: bool) -> Iterator[Any]:
+def _opened(endpoints: Endpoints, role: Role, peers_follow: bool) -> Iterator[tuple[Any, Links]]:
     said = ""
     while True:
         try:
@@ -272,13 +273,17 @@ def _opened(endpoints: Endpoints, role: Role, peers_follow: bool) -> Iterator[An
             _log.warning("%s; this goes on trying", text)
         said = text
         time.sleep(_LISTEN_S)
-    on_link = in_transport_thread(lambda _: _close_without_waiting())
+    links = Links(None if endpoints.credentials is None else endpoints.credentials.members)
     with session:
         with short_slices():
+            on_link = in_transport_thread(links.on_event)
             listener = session.info.declare_link_events_listener(on_link)
         with listener:
-            _close_without_waiting()  # links that stand already; to list them, low-latency, panics
-            yield session
+            if not endpoints.low_latency:  # as above
+                for link in session.info.links():
+                    links.note(link)
+            links.tend()
+            yield session, links
 
 
 def _not_opened(endpoints: Endpoints, error: Exception) -> InputError:
@@ -293,31 +298,6 @@ def _not_opened(endpoints: Endpoints, error: Exception) -> InputError:
         f"{(cause[0] if cause else text[:300]).strip()}; "
         "choose another endpoint or end the process that uses it"
     )
-
-
-def _close_without_waiting() -> None:
-    """Switches SO_LINGER off on this process's sockets; the system still delivers what was sent.
-
-    Zenoh lets each of its TCP sockets linger for 10 s, in a thread that serves all links: where the
-    other end has stopped reading, closing its link would hold up the messages of all others for so
-    long (eclipse-zenoh/zenoh#2350).
-    """
-    try:
-        paths = list(Path("/dev/fd").iterdir())
-    except OSError:  # a flood of connections has all descriptors: at the next link
-        return
-    for path in paths:
-        try:
-            one = socket.socket(fileno=int(path.name))
-        except OSError:  # no socket, or closed since
-            continue
-        try:
-            if struct.unpack("ii", one.getsockopt(socket.SOL_SOCKET, socket.SO_LINGER, 8))[0]:
-                one.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 0, 0))
-        except OSError:  # a socket without such an option, or closed since
-            continue
-        finally:
-            one.detach()
 
 
 def _without_settings(endpoint: str) -> str:

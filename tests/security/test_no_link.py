@@ -186,7 +186,7 @@ def test_doctor_says_what_else_may_be_wrong(cli: Cli, bundles: Bundles, tmp_path
 
 
 def test_an_older_list_of_members_is_said_by_commands_and_doctor(cli: Cli, tmp_path: Path) -> None:
-    """A plant that does not have this machine's certificate in its list drops every message."""
+    """A plant that does not have this machine's certificate in its list closes every link."""
     certs, folder = tmp_path / "certs", tmp_path / "plant"
     init(certs)
     shutil.copytree(add(certs, "plant", "plant", CAR), folder)
@@ -200,7 +200,7 @@ def test_an_older_list_of_members_is_said_by_commands_and_doctor(cli: Cli, tmp_p
         commanded = cli("status", "--timeout", "0.5", "--config", config)
         examined = cli("doctor", "--config", config)
         token.undeclare()
-    words = (f"linked to {where}", "no car is visible", "newest members.json", "start it again")
+    words = (f"no connection to {where}", "newest members.json", "start it again")
     refused(commanded, *words)
     assert examined.code == 1
     assert all(word in examined.out for word in words)
