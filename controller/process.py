@@ -11,6 +11,7 @@ import gc
 import logging
 import sys
 import time
+from collections.abc import Callable
 from typing import Any, Final
 
 from bayesrace.controller.cycle import Cycle
@@ -43,7 +44,7 @@ from bayesrace.transport import (
     Item,
     Kind,
     Publisher,
-    open_session,
+    open_sessions,
 )
 
 __all__ = ["ControllerProcess", "ControllerSettings", "main"]
@@ -121,16 +122,25 @@ class ControllerProcess:
         if self._weights is not None:
             self._weights.stop()
 
-    def serve(self) -> None:
-        """Until SIGINT or SIGTERM."""
+    def serve(self, renewed: Callable[[], Any] = lambda: None) -> None:
+        """Until SIGINT or SIGTERM; ``renewed``: :meth:`.Sessions.renewed`, between runs."""
         state: State | None = None
         while not self._service.stopping:
+            if self._silent():
+                self._renew(renewed)
             if state is None or state.final:
                 state = self._wait()
             elif state.lockstep:
                 state = self._lockstep(state)
             else:
                 state = self._free_running(state)
+
+    def _renew(self, renewed: Callable[[], Any]) -> None:
+        if (session := self._service.renew(renewed)) is not None:
+            for one in (self._actuations, self._telemetry, self._braking, self.inbox):
+                one.bind(session)
+            if self._weights is not None:
+                self._weights.bind(session)
 
     # Waiting -----------------------------------------------------------------------------------
 
@@ -413,8 +423,8 @@ def main(settings: ControllerSettings, controller: Controller) -> int:
     """
     die_with_parent(settings.parent_pid)
     settings.endpoints.check_car(settings.name or settings.car.name)
-    with open_session(settings.endpoints, "controller") as session:
-        process = ControllerProcess(session, settings, controller)
+    with open_sessions(settings.endpoints, "controller") as sessions:
+        process = ControllerProcess(sessions.current, settings, controller)
         # The control thread gets the interpreter's lock back from another thread this soon.
         sys.setswitchinterval(_SWITCH_S)
         try:
@@ -426,7 +436,7 @@ def main(settings: ControllerSettings, controller: Controller) -> int:
                 ", ".join(settings.endpoints.connect) or "(connects to us)",
             )
             with process.inbox.receive_signals():
-                process.serve()
+                process.serve(sessions.renewed)
         finally:
             process.close()
     return 0

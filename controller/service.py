@@ -65,6 +65,14 @@ class Service:
         """Publishes the status when it is due."""
         self._heartbeat.beat(self.status)
 
+    def renew(self, renewed: Callable[[], Any]) -> Any:
+        """The next session if there is one, see :meth:`.Sessions.renewed`; else None."""
+        with self._publishing:  # nobody publishes while there is none
+            if (session := renewed()) is not None:
+                self._events.bind(session)
+                self._heartbeat.bind(session)
+        return session
+
     def report_fault(self) -> None:
         """Publishes that states are not believed any more, or are again."""
         fault = self._driver.fault

@@ -18,7 +18,6 @@ With ``--watch`` there is a line for each heartbeat, about the car that it came 
 """
 
 import logging
-import queue
 import time
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -41,8 +40,15 @@ from bayesrace.messages import (
     car_key,
     is_car_name,
 )
-from bayesrace.processes import catching_signals
-from bayesrace.transport import Endpoints, Inbox, Kind, ask_all, decisive, open_session
+from bayesrace.transport import (
+    Endpoints,
+    Inbox,
+    Kind,
+    ask_all,
+    decisive,
+    open_session,
+    open_sessions,
+)
 from bayesrace.transport.credentials import NEWEST_LIST
 
 __all__ = [
@@ -62,6 +68,9 @@ SOURCES: Final = ("plant", "controller")
 
 _SILENT_S: Final = 1.0
 """A process without a heartbeat for this long, ten periods, counts as not answering."""
+
+_SPARE_S: Final = 2.0
+"""How long after all runs a router may open its links anew."""
 
 _DECLARATIONS_S: Final = 0.1
 """Time that declarations take to arrive after the last link is up."""
@@ -319,8 +328,14 @@ def follow(
 
 def route(endpoints: Endpoints) -> None:
     """Forward between all that connect to this process, until SIGINT or SIGTERM."""
-    signals: queue.SimpleQueue[int] = queue.SimpleQueue()
     # In this order: opening may wait for an endpoint, which a signal then ends.
-    with open_session(endpoints, "router"), catching_signals(signals.put):
-        _log.info("router on %s", ", ".join(endpoints.listen))
-        signals.get()
+    with open_sessions(endpoints, "router") as sessions:
+        inbox, spare_s = Inbox(sessions.current, None), 0.0
+        inbox.subscribe(HEARTBEAT, "plant")
+        with inbox.receive_signals():
+            _log.info("router on %s", ", ".join(endpoints.listen))
+            while (item := inbox.get(_SILENT_S)) is None or item.kind is not Kind.SIGNAL:
+                if item is not None and item.value is not None and item.value.phase == "running":
+                    spare_s = time.monotonic() + _SPARE_S
+                elif time.monotonic() > spare_s and (session := sessions.renewed()) is not None:
+                    inbox.bind(session)

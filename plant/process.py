@@ -4,7 +4,7 @@ import gc
 import logging
 import secrets
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from typing import Any
 
@@ -41,7 +41,7 @@ from bayesrace.transport import (
     Request,
     count_processes,
     decode_request,
-    open_session,
+    open_sessions,
 )
 
 __all__ = ["PlantProcess", "PlantSettings", "main"]
@@ -51,6 +51,8 @@ _log = logging.getLogger("bayesrace.plant")
 _ABANDONED_S = 10.0
 """A run ends when its director has been gone for so long; a link may come back before."""
 
+_SPARE_S = 2.0
+"""How long after a run the next one may follow, which links that are opened anew would hold up."""
 
 _RELINKED_S = 2.0
 """After a suspension links are there again in less."""
@@ -79,6 +81,8 @@ class PlantProcess:
         self._runs = 0
         self._text = f"no run so far with {_simulated_by(settings)}"
         self._stopping = False
+        self._spare_s = 0.0
+        """From when on links may be opened anew."""
         self._director_gone_ns: int | None = None
         """Since when the director is gone; None: it is there, or never was."""
         self._news: tuple[float, str, dict[str, Scalar]] | None = None
@@ -94,9 +98,13 @@ class PlantProcess:
         inbox.watch("director")
         inbox.announce("plant")
 
-    def serve(self) -> None:
-        """Until SIGINT or SIGTERM."""
+    def serve(self, renewed: Callable[[], Any] = lambda: None) -> None:
+        """Until SIGINT or SIGTERM; ``renewed``: :meth:`.Sessions.renewed`, between runs."""
         while not self._stopping:
+            if time.monotonic() > self._spare_s and (session := renewed()) is not None:
+                self._session = session
+                for one in (self._heartbeat, self._states, self._truths, self._events, self.inbox):
+                    one.bind(session)
             self._beat()
             item = self.inbox.get(HEARTBEAT_S)
             if item is None:
@@ -124,6 +132,7 @@ class PlantProcess:
         gc.collect()
         end = self._run.execute()
         self._conclude(message, end)
+        self._spare_s = time.monotonic() + _SPARE_S
 
     def _prepare(self, message: RunRequest) -> str:
         """Make the run; returns why it cannot be, or ""."""
@@ -316,12 +325,12 @@ def main(settings: PlantSettings, compiled: Compile | None = None) -> int:
         simulator=settings.simulator,
     )  # fmt: skip
     settings.endpoints.check_car(settings.name or settings.car.name)
-    with vehicles as vehicle, open_session(settings.endpoints, "plant") as session:
-        process = PlantProcess(session, settings, vehicle)
+    with vehicles as vehicle, open_sessions(settings.endpoints, "plant") as sessions:
+        process = PlantProcess(sessions.current, settings, vehicle)
         for refusal in prepare_thread(settings.realtime):
             _log.warning("%s", refusal)
         where = ", ".join(settings.endpoints.listen)
         _log.info("plant of car '%s', %s, on %s", process.name, _simulated_by(settings), where)
         with process.inbox.receive_signals():
-            process.serve()
+            process.serve(sessions.renewed)
     return 0

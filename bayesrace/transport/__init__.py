@@ -32,13 +32,14 @@ from bayesrace.transport.requests import (
     send_rollback,
     send_weights,
 )
-from bayesrace.transport.session import check_session, open_session
+from bayesrace.transport.session import check_session, open_session, open_sessions
 
 __all__ = [
     "CONTROLLER_ENDPOINT", "HEARTBEAT_S", "LOCKSTEP_SPIN_S", "NEWEST", "PLANT_ENDPOINT", "POLL_S",
     "Answers", "Credentials", "Director", "Endpoint", "Endpoints", "Heartbeat", "Inbox", "Item",
     "Kind", "LinkLimits", "Member", "Members", "Numbering", "Publisher", "RefusedError", "Request",
     "ask", "ask_all", "check_descriptors", "count_processes", "decisive",
-    "declare_service", "decode_request", "free_endpoint", "open_session", "private_endpoints",
+    "declare_service", "decode_request", "free_endpoint", "open_session", "open_sessions",
+    "private_endpoints",
     "send_rollback", "send_weights", "check_session",
 ]  # fmt: skip

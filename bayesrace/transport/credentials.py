@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "AUTHORITY", "CERTIFICATE", "CERTIFICATE_EXPIRED", "CERTIFICATE_NOT_YET", "COVERS", "EVERY_CAR",
-    "KEY", "MEMBERS", "NEWEST_LIST", "Credentials", "Member", "Members", "check_private",
+    "KEY", "MEMBERS", "NEWEST_LIST", "Credentials", "Member", "Members", "Watch", "check_private",
     "watching",
 ]  # fmt: skip
 
@@ -41,9 +41,7 @@ MEMBERS: Final = "members.json"
 _SEEN: Final = "members.seen"
 """The highest number of a list that was read here."""
 
-NEWEST_LIST: Final = (
-    f"give every process the newest {MEMBERS} of 'bayesrace certs', and start it again"
-)
+NEWEST_LIST: Final = f"give every process the newest {MEMBERS} of 'bayesrace certs'"
 """Remedy where a link stands and nothing comes over it: one end has an old list of members."""
 
 EVERY_CAR: Final = "*"
@@ -194,15 +192,11 @@ class Credentials(BaseModel):
 
 
 @contextmanager
-def watching(
-    credentials: Credentials,
-    changed: Callable[[Credentials], None],
-    failure: type[InputError] = InputError,
-) -> Iterator[None]:
-    """For the block, calls ``changed`` from a thread with each newer content of the folder.
+def watching(watch: "Watch", failure: type[InputError] = InputError) -> Iterator[None]:
+    """For the block, a thread looks at the folder once a second.
 
-    The expiry of the certificate interrupts the main thread; then the end of the block raises
-    ``failure`` with the reason. Zenoh closes such links, but opens them again.
+    The expiry of the certificate in use interrupts the main thread; then the end of the block
+    raises ``failure`` with the reason. Zenoh closes such links, but opens them again.
 
     Started in another thread, it only logs the reason. The log warns of the expiry each day for two
     weeks before.
@@ -212,17 +206,17 @@ def watching(
         _interrupting.release()
     over, expired = threading.Event(), threading.Event()
 
-    def watch() -> None:
-        if not _outlasted(credentials, over, changed):
+    def wait() -> None:
+        if not _outlasted(watch, over):
             return
         expired.set()
         if not in_main:
-            _log.error("%s", credentials.expired())
+            _log.error("%s", watch.used.expired())
         elif _interrupting.acquire(blocking=False):
             # Not to the process: another thread would get it, and the main one would sleep on.
             signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
 
-    thread = threading.Thread(target=watch, name="expiry", daemon=True)
+    thread = threading.Thread(target=wait, name="expiry", daemon=True)
     thread.start()
     try:
         try:
@@ -232,27 +226,50 @@ def watching(
             thread.join()
     except (InputError, KeyboardInterrupt) as error:
         if expired.is_set():
-            raise failure(credentials.expired()) from error
+            raise failure(watch.used.expired()) from error
         raise
     if expired.is_set():
-        raise failure(credentials.expired())
+        raise failure(watch.used.expired())
 
 
-def _outlasted(
-    credentials: Credentials, over: threading.Event, changed: Callable[[Credentials], None]
-) -> bool:
-    """Waits for the expiry, and looks at the folder meanwhile; False if it is over before."""
-    remind_s, newest, known = 0.0, credentials, tuple[Any, ...]()
-    while (left_s := credentials.ends_s - time.time()) > 0:
-        if time.monotonic() >= remind_s and (warning := credentials.expires_soon()):
+class Watch:
+    """What is in the folder of a certificate while its process runs."""
+
+    def __init__(self, own: Credentials, role: Role, changed: Callable[[Members], None]) -> None:
+        """``changed`` is called with each newer list of members."""
+        self.used = self.newest = own
+        """With which the session was opened, and with which the next one can be."""
+        self._role, self._changed = role, changed
+        self._members, self._stamps = own.members, tuple[Any, ...]()
+
+    def look(self) -> None:
+        """Reads it again if a file has changed; the log says what cannot be used."""
+        before, self._stamps = self._stamps, _stamps(self.used.folder)
+        if before == self._stamps:
+            return
+        try:
+            now = Credentials.read(self.used.folder)
+            now.members.check_newer(self._members.number, now.folder / MEMBERS)
+            if now.members != self._members:
+                self._members = now.members
+                self._changed(now.members)
+            now.check(self._role)
+        except InputError as error:
+            _log.warning("%s; what was read before stays in use", error)
+            return
+        self.newest = now
+
+
+def _outlasted(watch: Watch, over: threading.Event) -> bool:
+    """Waits for the expiry; False if it is over before."""
+    remind_s = 0.0
+    while (left_s := watch.used.ends_s - time.time()) > 0:
+        if time.monotonic() >= remind_s and (warning := watch.newest.expires_soon()):
             _log.warning("%s", warning)
             remind_s = time.monotonic() + _REMINDER_S
         if over.wait(min(left_s, _CALENDAR_S)):
             return False
-        if (stamps := _stamps(credentials.folder)) != known:
-            known, before = stamps, newest
-            if (newest := _newer(before)) != before:
-                changed(newest)
+        watch.look()
     return True
 
 
@@ -264,17 +281,6 @@ def _stamps(folder: Path) -> tuple[Any, ...]:
             status = (folder / name).stat()
             stamps.append((name, status.st_ino, status.st_ctime_ns))
     return tuple(stamps)
-
-
-def _newer(before: Credentials) -> Credentials:
-    """The content of the folder now; what it was before if that cannot be used."""
-    try:
-        now = Credentials.read(before.folder)
-        now.members.check_newer(before.members.number, before.folder / MEMBERS)
-    except InputError as error:
-        _log.warning("%s; what was read before stays in use", error)
-        return before
-    return now
 
 
 def _members(folder: Path) -> Members:

@@ -106,6 +106,7 @@ class Inbox:
         self._car = car
         self._capacity = capacity
         self._queue: queue.SimpleQueue[Item] = queue.SimpleQueue()
+        self._declarations: list[Callable[[], Any]] = []
         self._declared: list[Any] = []
         self._decoders: dict[str, Decoder[Any]] = {}
         self._channels: deque[_Channel] = deque()
@@ -145,14 +146,17 @@ class Inbox:
         """
         decoder = self._decoders[topic.name] = Decoder(topic.message, logger)
         key = self._key(topic.key, source)
-        if newest is None:
-            self._declared.append(self._into_queue(topic.name, key))
-        else:
+
+        def declare() -> Any:
+            if newest is None:
+                return self._into_queue(topic.name, key)
             channel: Any = zenoh.handlers.RingChannel(newest)
             subscriber = self._session.declare_subscriber(key, channel)
-            self._declared.append(subscriber)
             take = subscriber.handler.try_recv
             self._channels.append(_Channel(topic.name, key, take, decoder))
+            return subscriber
+
+        self._declare(declare)
         return decoder
 
     def serve(self, service: Service[Any, Any], source: str = "") -> None:
@@ -167,13 +171,15 @@ class Inbox:
                 self.requests_rejected += 1
                 request.reject(f"{_REQUESTS} requests are waiting; try again")
 
-        served = declare_service(self._session, service, self._car or "", on_request, source=source)
-        self._declared.append(served)
+        car = self._car or ""
+        self._declare(
+            lambda: declare_service(self._session, service, car, on_request, source=source)
+        )
 
     def announce(self, source: str) -> None:
         """Declare this process's liveliness token: last, when everything else is in place."""
-        token = self._session.liveliness().declare_token(self._key(ALIVE, source))
-        self._declared.append(token)
+        key = self._key(ALIVE, source)
+        self._declare(lambda: self._session.liveliness().declare_token(key))
 
     def watch(self, source: str = "*") -> None:
         """Receive the appearance and disappearance of processes, those present now included."""
@@ -183,10 +189,22 @@ class Inbox:
             key = str(sample.key_expr)
             self._offer(kind, key.split("/")[-1] if source == "*" else source, None, key)
 
-        tokens, handler = self._session.liveliness(), in_transport_thread(on_token)
-        self._declared.append(
-            tokens.declare_subscriber(self._key(ALIVE, source), handler, history=True)
+        watched, handler = self._key(ALIVE, source), in_transport_thread(on_token)
+        self._declare(
+            lambda: self._session.liveliness().declare_subscriber(watched, handler, history=True)
         )
+
+    def bind(self, session: Any) -> None:
+        """Receive the same over this session from now on; that of before is closed."""
+        self._session = session
+        self._channels.clear()
+        for source in self.alive:
+            self._offer(Kind.GONE, source, None)
+        self._declared = [declare() for declare in self._declarations]
+
+    def _declare(self, declare: Callable[[], Any]) -> None:
+        self._declarations.append(declare)
+        self._declared.append(declare())
 
     def receive_signals(self) -> AbstractContextManager[None]:
         """For the block, SIGINT and SIGTERM arrive as items; no effect off the main thread."""
@@ -297,7 +315,7 @@ class Inbox:
             self._shared.pop(item.name, None)
         return item
 
-    def _offer(self, kind: Kind, name: str, value: Any, key: str) -> None:
+    def _offer(self, kind: Kind, name: str, value: Any, key: str = "") -> None:
         """In the transport's thread: another process must not fill the memory."""
         if self._queue.qsize() < self._capacity:
             self._queue.put(Item(kind, name, value, time.monotonic_ns(), key))

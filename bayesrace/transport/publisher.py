@@ -38,14 +38,20 @@ class Publisher(Generic[M]):
             "priority": getattr(zenoh.Priority, topic.qos.priority.upper()),
             "reliability": zenoh.Reliability.RELIABLE,
         }
-        key, declare = car_key(topic.key, car, source), session.declare_publisher
-        self._lockstep = declare(key, congestion_control=control.BLOCK, **settings)
-        realtime = control.BLOCK if topic.qos.realtime_blocks and waits else control.DROP
-        self._realtime = declare(key, congestion_control=realtime, **settings)
+        self._declared = car_key(topic.key, car, source), settings
+        self._control = control.BLOCK if topic.qos.realtime_blocks and waits else control.DROP
+        self.bind(session)
         self.next_seq = 0
         """``seq`` that the next message must have."""
         self.sent_ns: int | None = None
         """Monotonic clock after the newest message was sent."""
+
+    def bind(self, session: Any) -> None:
+        """Send over this session from now on."""
+        (key, settings), declare = self._declared, session.declare_publisher
+        block = zenoh.CongestionControl.BLOCK
+        self._lockstep = declare(key, congestion_control=block, **settings)
+        self._realtime = declare(key, congestion_control=self._control, **settings)
 
     def put(self, message: M, *, lockstep: bool) -> None:
         """Send the message.
@@ -68,6 +74,7 @@ class Heartbeat:
     def __init__(self, session: Any, car: str, source: Literal["plant", "controller"]) -> None:
         self._publisher = Publisher(session, HEARTBEAT, car, source)
         self._due_ns = 0
+        self.bind = self._publisher.bind
         name = os.environ.get(HEARTBEAT_VARIABLE)
         try:
             self._file = Path(name).open("ab") if name else None  # noqa: SIM115 (while it runs)

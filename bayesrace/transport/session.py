@@ -18,7 +18,8 @@ import re
 import time
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
-from contextlib import ExitStack, contextmanager
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, closing, contextmanager, nullcontext
 from typing import Any, Final
 
 import zenoh
@@ -43,13 +44,17 @@ from bayesrace.transport.credentials import (
     KEY,
     Credentials,
     Members,
+    Watch,
     watching,
 )
 from bayesrace.transport.endpoints import Endpoints, address_of, check_descriptors, leaves
 from bayesrace.transport.links import Links
 from bayesrace.transport.requests import in_transport_thread
 
-__all__ = ["open_session", "check_session", "access_control", "unlinked", "zenoh_config"]
+__all__ = [
+    "Sessions", "access_control", "check_session", "open_session", "open_sessions", "unlinked",
+    "zenoh_config",
+]  # fmt: skip
 
 _log = logging.getLogger("bayesrace.links")
 
@@ -204,6 +209,73 @@ def open_session(
     Where the process's certificate expires, the main thread gets a SIGINT, and the end of the block
     raises InputError with the reason: RestartError in a plant, controller or router.
     """
+    with open_sessions(
+        endpoints, role, peers_follow=peers_follow, reports_absence=reports_absence
+    ) as sessions:
+        yield sessions.current
+
+
+class Sessions:
+    """The session of a process, and the next one, where the process can spare its links."""
+
+    def __init__(self, endpoints: Endpoints, role: Role) -> None:
+        self._endpoints, self._role, self._stack = endpoints, role, ExitStack()
+        self._links: Links | None = None
+        own = endpoints.credentials
+        self.watch = None if own is None else Watch(own, role, self._update)
+        # A thread that the system treats as all others, whatever becomes of the calling one.
+        self._opener = ThreadPoolExecutor(1)
+        if own is not None and role in _SERVERS:
+            self._opener.submit(int)
+        self.current: Any = None
+        """Open, of Zenoh."""
+
+    def open(self, *, peers_follow: bool = False, waits: bool) -> None:
+        """Opens it; ``waits``: for an endpoint to listen on."""
+        opened = _opened(self._endpoints, self._role, peers_follow, waits)
+        self.current, self._links = self._stack.enter_context(opened)
+
+    def close(self) -> None:
+        """Closes it."""
+        self._stack.close()
+
+    def renewed(self) -> Any:
+        """Another one in its place, with the certificate and the list of members that are in the
+        folder now; None if they are what this one was opened with.
+
+        What was declared in the session has to be declared again, see :meth:`.Inbox.bind`. Raises
+        RestartError if it cannot be opened.
+        """
+        watch = self.watch
+        if watch is None or watch.newest == watch.used:
+            return None
+        watch.used = watch.newest
+        self._endpoints = self._endpoints.model_copy(update={"credentials": watch.used})
+        try:
+            self._opener.submit(self._reopen).result()
+        except InputError as error:
+            raise RestartError(str(error)) from error
+        _log.info("links are opened anew, with list %d of members", watch.used.members.number)
+        return self.current
+
+    def _reopen(self) -> None:
+        self.close()
+        self.open(waits=False)
+
+    def _update(self, members: Members) -> None:
+        if self._links is not None:
+            self._links.update(members)
+
+
+@contextmanager
+def open_sessions(
+    endpoints: Endpoints,
+    role: Role,
+    *,
+    peers_follow: bool = False,
+    reports_absence: bool = True,
+) -> Iterator[Sessions]:
+    """The same, for a process that goes on where its certificate or the members change."""
     os.environ.setdefault("ZENOH_RUNTIME", _RUNTIME)
     check_session(endpoints, role)
     if endpoints.exposed:
@@ -211,22 +283,23 @@ def open_session(
             "INSECURE: links by %s are open to everyone in that network, who could drive the car; "
             "see docs/security.md", ", ".join(endpoints.exposed),
         )  # fmt: skip
-    own = endpoints.credentials
     failure = RestartError if role in _SERVERS else InputError
-    with ExitStack() as stack:
-        session, links = stack.enter_context(_opened(endpoints, role, peers_follow))
-        if own is not None:
-            stack.enter_context(watching(own, lambda new: links.update(new.members), failure))
+    sessions = Sessions(endpoints, role)
+    with (
+        nullcontext() if sessions.watch is None else watching(sessions.watch, failure),
+        closing(sessions),
+    ):
+        sessions.open(peers_follow=peers_follow, waits=role in _SERVERS)
         missing: list[str] = []
         if reports_absence and not peers_follow:
             with short_slices():  # Zenoh may start threads for these calls, too
-                missing = unlinked(session, endpoints, _LINK_S)
+                missing = unlinked(sessions.current, endpoints, _LINK_S)
         if missing:
             _log.warning(
                 "no link to %s yet; this goes on trying, and 'bayesrace doctor' says why there is "
                 "none", ", ".join(missing),
             )  # fmt: skip
-        yield session
+        yield sessions
 
 
 def check_session(endpoints: Endpoints, role: Role) -> None:
@@ -258,7 +331,9 @@ def _unlinked(session: Any, endpoints: Endpoints) -> list[str]:
 
 
 @contextmanager
-def _opened(endpoints: Endpoints, role: Role, peers_follow: bool) -> Iterator[tuple[Any, Links]]:
+def _opened(
+    endpoints: Endpoints, role: Role, peers_follow: bool, waits: bool
+) -> Iterator[tuple[Any, Links]]:
     said = ""
     while True:
         try:
@@ -267,7 +342,7 @@ def _opened(endpoints: Endpoints, role: Role, peers_follow: bool) -> Iterator[tu
             break
         except zenoh.ZError as error:
             failure = _not_opened(endpoints, error)
-        if role not in _SERVERS or not isinstance(failure, TransientError):
+        if not waits or not isinstance(failure, TransientError):
             raise failure
         if (text := str(failure)) != said:
             _log.warning("%s; this goes on trying", text)

@@ -73,8 +73,13 @@ class WeightUpdateManager:
         self._waiting: Queue[tuple[float, int, Request]] = Queue(_MOST_WAITING)
         self._most_bytes = 3 * 8 * 7 * (port.step.manifest.gp_capacity + 1) + _FILE_BYTES
         self._thread = threading.Thread(target=self._run, name="weights", daemon=True)
+        self._name = name
+        self.bind(session)
+
+    def bind(self, session: Any) -> None:
+        """Serves requests of this session from now on."""
         self._services = [
-            declare_service(session, service, name, self._arrive, self._most_bytes)
+            declare_service(session, service, self._name, self._arrive, self._most_bytes)
             for service in (WEIGHTS, ROLLBACK)
         ]
 

@@ -100,8 +100,8 @@ def add(
 ) -> None:
     """Make a certificate: a folder to copy to the machine of its process.
 
-    The list of members in all the folders changes: copy that, too, to where they are, and restart
-    the processes there.
+    The list of members in all the folders changes: copy that, too, to where they are. Processes
+    there use it at once, or after a run.
     """
     from bayesrace.operation.certificates import add as make
 
@@ -126,14 +126,14 @@ def revoke(
 ) -> None:
     """Take a certificate off the list of members, for ever.
 
-    It counts no more where the new list is and the process has been restarted.
+    Its links are closed within a second where the new list is.
     """
     from bayesrace.operation.certificates import revoke as take_off
 
     take_off(_folder(folder, configuration), name)
     typer.echo(
-        f"'{name}' is revoked: copy members.json to each machine, and restart the processes there; "
-        "until then they accept it"
+        f"'{name}' is revoked: copy members.json to each machine; until then processes there "
+        "accept it"
     )
 
 

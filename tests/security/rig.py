@@ -38,6 +38,7 @@ class Rig:
     closing: ExitStack
     plant: Program
     controller: Program
+    router: Program | None = None
 
     def drive(self, number: int, *, lockstep: bool, laps: int = 1) -> None:
         """Starts a run."""
@@ -75,8 +76,9 @@ def secured(
         config.write_text(text)
     options = ("--config", config)
     with ExitStack() as stack:
+        between: Program | None = None
         if router:
-            stack.enter_context(Program(folder / "router.txt", "router", *options))
+            between = stack.enter_context(Program(folder / "router.txt", "router", *options))
         plant = stack.enter_context(Program(folder / "plant.txt", "plant", *options))
         driver = ("controller", *course.arguments, *options)
         controller = stack.enter_context(Program(folder / "controller.txt", *driver))
@@ -89,5 +91,5 @@ def secured(
         closing.enter_context(Recorder(session, CAR, log))
         yield Rig(
             config, bundles, router_at if router else plant_at, director, course, log, closing,
-            plant, controller,
+            plant, controller, between,
         )  # fmt: skip

@@ -1,16 +1,19 @@
 """Members come and go while the others drive; what one does who is not a member any more."""
 
+import json
 import time
 from pathlib import Path
 
 import pytest
 
+from bayesrace.configuration import read_configuration
 from bayesrace.messages import COMMAND, STOP, Command, StopRequest, car_key, encode
 from bayesrace.operation.certificates import add, init, revoke
+from bayesrace.transport import free_endpoint
 from tests.driven import blank
-from tests.network.cars import Course
-from tests.programs import until
-from tests.security.authority import CAR, Bundles
+from tests.network.cars import Course, Program
+from tests.programs import run, until
+from tests.security.authority import CAR, Bundles, written
 from tests.security.intruder import bare_session
 from tests.security.rig import course, secured
 
@@ -18,6 +21,7 @@ __all__ = ["course"]
 
 pytestmark = [pytest.mark.wall_clock, pytest.mark.unmeasured]
 
+BRIEF_S = 15.0
 CLOSED_S = 2.0
 """Within so long the links of a revoked member are closed."""
 
@@ -44,7 +48,7 @@ def answers(session: object) -> int:
 def test_a_revoked_director_is_cut_off_while_a_drive_goes_on(
     tmp_path: Path, course: Course
 ) -> None:
-    """It goes on to connect, and to ask at once each time."""
+    """It goes on to connect, and to ask at once each time; an older list does not help it."""
     bundles = members(tmp_path / "certs")
     with secured(tmp_path, course, bundles) as rig:
         rig.drive(1, lockstep=False, laps=0)
@@ -56,11 +60,14 @@ def test_a_revoked_director_is_cut_off_while_a_drive_goes_on(
             listener = session.info.declare_link_events_listener(
                 lambda event: gone.append(time.monotonic())
             )
+            older = (bundles.path("plant") / "members.json").read_bytes()
             revoke(bundles.folder, "former")
             begin_s = time.monotonic()
             until(lambda: gone, "its end")
             assert gone[0] - begin_s < CLOSED_S
             listener.undeclare()
+            (bundles.path("plant") / "members.json").write_bytes(older)
+            until(lambda: "members.json has number" in rig.plant.said(), "the older list refused")
             ends_s, tries = time.monotonic() + 2.0, 0
             while time.monotonic() < ends_s:
                 assert answers(session) == 0
@@ -78,3 +85,57 @@ def test_a_revoked_director_is_cut_off_while_a_drive_goes_on(
         assert "vanished" not in rig.controller.said()
         journey = rig.journey()
     assert journey.off_track_m() <= 0
+
+
+@pytest.mark.check
+def test_a_renewed_certificate_outlasts_the_one_before(tmp_path: Path) -> None:
+    bundles = Bundles(tmp_path / "certs")
+    init(bundles.folder)
+    add(bundles.folder, "plant", "plant", CAR, days=BRIEF_S / 86400)
+    ends_s = bundles.credentials("plant").ends_s
+    config = written(tmp_path, bundles, free_endpoint("tls"), free_endpoint("tls"))
+    with Program(tmp_path / "plant.txt", "plant", "--config", config) as plant:
+        until(lambda: "plant of car" in plant.said(), "the plant")
+        add(bundles.folder, "plant", None, days=1, renew=True)
+        until(lambda: time.time() > ends_s + 2.0, "the end of the first one")
+        assert plant.process.poll() is None, plant.said()
+        plant.end()
+
+
+@pytest.mark.parametrize("router", [False, True], ids=["direct", "router"])
+def test_an_added_director_and_renewed_certificates_need_no_restart(
+    tmp_path: Path, course: Course, router: bool
+) -> None:
+    """What a controller has in use, counts and was commanded stays; the processes are the same."""
+    bundles = members(tmp_path / "certs")
+    if router:
+        add(bundles.folder, "router", "router")
+    with secured(tmp_path, course, bundles, router=router) as rig:
+        rig.drive(1, lockstep=True)
+        assert rig.end(1).data["reason"] == "laps"
+        assert run("stop", "--config", rig.config).returncode == 0
+        before = rig.count("controller", "states_received", "weights_number")
+        add(bundles.folder, "new", "director")
+        for name in ("plant", "controller", *(["router"] if router else [])):
+            add(bundles.folder, name, None, renew=True)
+        programs = [rig.plant, rig.controller, *([rig.router] if rig.router else [])]
+        until(lambda: all("opened anew" in one.said() for one in programs), "new links")
+        folder = tmp_path / "new"
+        folder.mkdir()
+        network = read_configuration(rig.config).network
+        config = written(folder, bundles, network.plant[0], network.controller[0], director="new")
+        if router:
+            config.write_text(rig.config.read_text().replace("use = {", 'use = { director = "new"'))
+        until(lambda: run("status", "--config", config).returncode == 0, "a status")
+        cars = json.loads(run("status", "--json", "--config", config).stdout)["cars"]
+        status = cars[CAR]["controller"]
+        assert before.items() <= status["counters"].items()
+        rig.drive(2, lockstep=False, laps=0)
+        until(lambda: rig.phase() == "stopped", "that it is still stopped")
+        assert run("go", "--config", config).returncode == 0
+        until(lambda: rig.phase() == "driving", "driving")
+        assert run("stop", "--run", "--config", config).returncode == 0
+        assert rig.end(2).data["reason"] == "stopped"
+        for program in programs:
+            assert program.process.poll() is None
+            program.end()

@@ -200,7 +200,7 @@ def test_an_older_list_of_members_is_said_by_commands_and_doctor(cli: Cli, tmp_p
         commanded = cli("status", "--timeout", "0.5", "--config", config)
         examined = cli("doctor", "--config", config)
         token.undeclare()
-    words = (f"no connection to {where}", "newest members.json", "start it again")
+    words = ("newest members.json",)
     refused(commanded, *words)
     assert examined.code == 1
     assert all(word in examined.out for word in words)
