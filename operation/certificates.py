@@ -9,7 +9,7 @@ import ipaddress
 import os
 import re
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -19,6 +19,7 @@ from cryptography import x509
 from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.serialization import (
+    BestAvailableEncryption,
     Encoding,
     NoEncryption,
     PrivateFormat,
@@ -68,8 +69,11 @@ class _Register(BaseModel):
     entries: dict[str, Entry] = {}
 
 
-def init(folder: Path) -> None:
-    """Make an authority; InputError if there is one already."""
+def init(folder: Path, passphrase: str = "") -> None:
+    """Make an authority, whose key is encrypted with the passphrase if there is one.
+
+    InputError if there is an authority already.
+    """
     authority = folder / _FOLDER
     if authority.exists():
         raise InputError(f"{authority} exists: use it, or name another folder with --folder")
@@ -82,7 +86,7 @@ def init(folder: Path) -> None:
         .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
         .add_extension(_usage(signs=True), critical=True)
     )
-    _write_private(authority / KEY, key)
+    _write_private(authority / KEY, key, passphrase)
     certificate = builder.sign(key, hashes.SHA256())
     write_whole(authority / AUTHORITY, certificate.public_bytes(Encoding.PEM))
     _write_register(folder, _Register(), key)
@@ -96,12 +100,14 @@ def add(
     hosts: Sequence[str] = (),
     days: float = 365,
     renew: bool = False,
+    ask: Callable[[], str] = str,
 ) -> Path:
     """Make a certificate, or with ``renew`` a new one of the same name; its folder.
 
-    ``car``: the one that it is for, None: all. What is not given when renewing stays.
+    ``car``: the one that it is for, None: all. What is not given when renewing stays. ``ask``: for
+    the passphrase, where the key of the authority has one.
     """
-    with _changing(folder) as (register, signs):
+    with _changing(folder, ask) as (register, signs):
         before = register.entries.get(name)
         _check_name(name, before, renew)
         if before is not None:
@@ -125,9 +131,9 @@ def add(
         return target
 
 
-def revoke(folder: Path, name: str) -> None:
+def revoke(folder: Path, name: str, ask: Callable[[], str] = str) -> None:
     """Take a name off the list of members, for ever; InputError if it is not on it."""
-    with _changing(folder) as (register, signs):
+    with _changing(folder, ask) as (register, signs):
         if (entry := register.entries.get(name)) is None:
             known = ", ".join(sorted(register.entries)) or "none"
             raise InputError(f"no certificate '{name}' in {folder}; there are: {known}")
@@ -151,16 +157,23 @@ def _read(folder: Path) -> _Register:
 
 
 @contextmanager
-def _changing(folder: Path) -> Iterator[tuple[_Register, ec.EllipticCurvePrivateKey]]:
+def _changing(
+    folder: Path, ask: Callable[[], str]
+) -> Iterator[tuple[_Register, ec.EllipticCurvePrivateKey]]:
     """The register, which no other process changes within the block, and the key that signs."""
     _read(folder)  # there is one
     with claimed(folder / _FOLDER):
-        yield _read(folder), _signing_key(folder)
+        yield _read(folder), _signing_key(folder / _FOLDER / KEY, ask)
 
 
-def _signing_key(folder: Path) -> ec.EllipticCurvePrivateKey:
-    path = folder / _FOLDER / KEY
-    key = load_pem_private_key(path.read_bytes(), None)
+def _signing_key(path: Path, ask: Callable[[], str]) -> ec.EllipticCurvePrivateKey:
+    data = path.read_bytes()
+    passphrase = ask().encode() if b"ENCRYPTED" in data else None
+    try:
+        key = load_pem_private_key(data, passphrase)
+    except (TypeError, ValueError):
+        wrong = "is not opened by this passphrase" if passphrase is not None else "is no key"
+        raise InputError(f"{path} {wrong}: nothing has been changed") from None
     if not isinstance(key, ec.EllipticCurvePrivateKey):
         raise InputError(f"{path} is no key of 'bayesrace certs init'")
     return key
@@ -272,6 +285,7 @@ def _alternatives(hosts: Sequence[str]) -> x509.SubjectAlternativeName:
     return x509.SubjectAlternativeName(names)
 
 
-def _write_private(path: Path, key: ec.EllipticCurvePrivateKey) -> None:
-    data = key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())
+def _write_private(path: Path, key: ec.EllipticCurvePrivateKey, passphrase: str = "") -> None:
+    how = BestAvailableEncryption(passphrase.encode()) if passphrase else NoEncryption()
+    data = key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, how)
     write_whole(path, data, private=True)

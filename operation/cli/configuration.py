@@ -1,5 +1,7 @@
 """``config``, ``certs``: where the processes of a system are, and how they know each other."""
 
+import os
+import sys
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, get_args
@@ -22,6 +24,7 @@ _FOLDER: Final = options.value(
     metavar="DIR",
     shown="[tls] folder as configured; certs",
 )
+_VARIABLE: Final = "BAYESRACE_PASSPHRASE"
 _NAME: Final = options.argument("NAME", "Name in the certificate.")
 
 
@@ -75,12 +78,31 @@ def _folder(given: Path | None, configuration: "Configuration") -> Path:
     return given or configuration.tls.folder or Path("certs")
 
 
-def init(configuration: "Configuration", folder: Path | None = _FOLDER) -> None:
+def _passphrase(new: bool = False) -> str:
+    """Of the authority's key: from the environment, or from who sits at the terminal."""
+    if given := os.environ.get(_VARIABLE):
+        return given
+    if not sys.stdin.isatty():
+        raise InputError(
+            f"the authority's key has a passphrase: give it in {_VARIABLE}, or at a terminal"
+        )
+    text = "Passphrase of the authority's key"
+    return str(typer.prompt(text, hide_input=True, confirmation_prompt=new, err=True))
+
+
+def init(
+    configuration: "Configuration",
+    passphrase: bool = options.flag(
+        "--passphrase",
+        f"Encrypt its key; 'certs add' and 'revoke' then ask, or read {_VARIABLE}.",
+    ),
+    folder: Path | None = _FOLDER,
+) -> None:
     """Make the authority of a system, once; its folder 'authority' belongs on no car."""
     from bayesrace.operation.certificates import init as make
 
     where = _folder(folder, configuration)
-    make(where)
+    make(where, _passphrase(new=True) if passphrase else "")
     typer.echo(f"{where}: next, 'bayesrace certs add NAME --role ROLE'")
 
 
@@ -94,7 +116,9 @@ def add(
         (),
         shown="loopback only",
     ),
-    days: int = options.value("Days until it expires.", 365, min=1, max=3650),
+    days: float = options.value(
+        "Days until it expires.", 365.0, metavar="D", min=1 / 24, max=3650.0
+    ),
     renew: bool = options.flag("--renew", "Replace the one of this name; what is not given stays."),
     folder: Path | None = _FOLDER,
 ) -> None:
@@ -105,7 +129,8 @@ def add(
     """
     from bayesrace.operation.certificates import add as make
 
-    made = make(_folder(folder, configuration), name, role, car, host, days, renew)
+    where = _folder(folder, configuration)
+    made = make(where, name, role, car, host, days, renew, _passphrase)
     typer.echo(f"{made}: copy it to its machine, and members.json in it to the others")
 
 
@@ -114,11 +139,11 @@ def members(configuration: "Configuration", folder: Path | None = _FOLDER) -> No
     from bayesrace.operation.certificates import read_register
 
     for name, one in sorted(read_register(_folder(folder, configuration)).items()):
-        state = "revoked" if one.revoked else f"until {one.ends:%Y-%m-%d}"
+        state = "revoked" if one.revoked else f"until {one.ends:%Y-%m-%d %H:%M}"
         if not one.revoked and one.ends < datetime.now(UTC):
-            state = f"expired {one.ends:%Y-%m-%d}"
+            state = f"expired {one.ends:%Y-%m-%d %H:%M}"
         hosts = ", ".join(one.hosts) or "loopback"
-        typer.echo(f"{name:<20} {one.role:<10} car {one.car:<12} {state:<18} {hosts}")
+        typer.echo(f"{name:<20} {one.role:<10} car {one.car:<12} {state:<24} {hosts}")
 
 
 def revoke(
@@ -130,7 +155,7 @@ def revoke(
     """
     from bayesrace.operation.certificates import revoke as take_off
 
-    take_off(_folder(folder, configuration), name)
+    take_off(_folder(folder, configuration), name, _passphrase)
     typer.echo(
         f"'{name}' is revoked: copy members.json to each machine; until then processes there "
         "accept it"

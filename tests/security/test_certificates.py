@@ -105,6 +105,26 @@ def test_what_cannot_be_made_is_refused(
     refused(cli("certs", *arguments), *words)
 
 
+def test_an_encrypted_key_signs_with_its_passphrase_alone(
+    cli: Cli, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    refused(cli("certs", "init", "--passphrase"), "BAYESRACE_PASSPHRASE", "terminal")
+    monkeypatch.setenv("BAYESRACE_PASSPHRASE", "correct horse")
+    assert cli("certs", "init", "--passphrase").code == 0
+    authority, folder = tmp_path / "certs" / "authority", tmp_path / "certs" / "a"
+    assert "BEGIN ENCRYPTED PRIVATE KEY" in (authority / "key.pem").read_text()
+    assert cli("certs", "add", "a", "--role", "viewer", "--days", "0.5").code == 0
+    before = Credentials.read(folder)
+    monkeypatch.setenv("BAYESRACE_PASSPHRASE", "wrong")
+    for command in (("add", "b", "--role", "viewer"), ("add", "a", "--renew"), ("revoke", "a")):
+        refused(cli("certs", *command), "authority/key.pem is not opened by this passphrase")
+    monkeypatch.delenv("BAYESRACE_PASSPHRASE")
+    refused(cli("certs", "revoke", "a"), "BAYESRACE_PASSPHRASE", "terminal")
+    assert Credentials.read(folder) == before
+    assert not (tmp_path / "certs" / "b").exists()
+    assert cli("certs", "list").code == 0
+
+
 def test_only_one_process_at_a_time_changes_the_register(cli: Cli, tmp_path: Path) -> None:
     """Of four at once, three were in no list of members afterwards."""
     cli("certs", "init")
