@@ -31,7 +31,7 @@ from bayesrace.transport.endpoints import (
 )
 
 __all__ = [
-    "Configuration", "NetworkSettings", "TlsSettings", "as_toml", "configured",
+    "Configuration", "DriveSettings", "NetworkSettings", "TlsSettings", "as_toml", "configured",
     "read_configuration",
 ]  # fmt: skip
 
@@ -118,11 +118,21 @@ class TlsSettings(_Section):
         return [Credentials.read(folder) for folder in folders]
 
 
+class DriveSettings(_Section):
+    """How runs are driven."""
+
+    hold_to_run: bool = Field(
+        False,
+        description="dead man's switch: 'drive' holds its runs, the plant refuses those of others",
+    )
+
+
 class Configuration(_Section):
     """Everything in the file; what is left out has its default."""
 
     network: NetworkSettings = NetworkSettings()
     tls: TlsSettings = TlsSettings()
+    drive: DriveSettings = DriveSettings()
     realtime: RealtimeSettings = RealtimeSettings()
     limits: LinkLimits = LinkLimits()
     zenoh: ZenohSettings = Field(
@@ -158,9 +168,12 @@ class Configuration(_Section):
         )
 
     def plain(self, plant: str, controller: str) -> Self:
-        """The same for processes of one machine that meet there, without certificates."""
+        """The same for simulations on one machine whose processes meet there: without certificates
+        and dead man's switch."""
         network = NetworkSettings(plant=(plant,), controller=(controller,))
-        return self.model_copy(update={"network": network, "tls": TlsSettings()})
+        return self.model_copy(
+            update={"network": network, "tls": TlsSettings(), "drive": DriveSettings()}
+        )
 
 
 def configured() -> Configuration:

@@ -128,6 +128,7 @@ class ControllerProcess:
         while not self._service.stopping:
             if self._silent():
                 self._renew(renewed)
+            self._service.check_hold()
             if state is None or state.final:
                 state = self._wait()
             elif state.lockstep:
@@ -274,6 +275,7 @@ class ControllerProcess:
             if item is not None:
                 self._serve_ns = time.monotonic_ns() + _SERVE_NS
                 self._service.react(item)
+        self._service.check_hold()
         self._service.beat()
 
     def _late_state(self) -> State | None:
@@ -409,7 +411,7 @@ class ControllerProcess:
             "states_lost": driver.numbering.lost,
             "states_stale": driver.count("stale"),
             "states_foreign": driver.count("foreign"),
-            "refused": self._decoder.refused,
+            "refused": self._decoder.refused + self._service.hold.decoder.refused,
             "overflowed": self.inbox.overflowed,
             "requests_rejected": self.inbox.requests_rejected,
             "actuations_sent": self._actuations.next_seq,

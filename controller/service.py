@@ -5,7 +5,7 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Any, Final
 
-from bayesrace.controller.driver import Driver, Level
+from bayesrace.controller.driver import Driver, Level, Phase
 from bayesrace.controller.weights.manager import WeightUpdateManager
 from bayesrace.messages import (
     COMMAND,
@@ -18,6 +18,7 @@ from bayesrace.messages import (
     Status,
 )
 from bayesrace.transport import Heartbeat, Inbox, Item, Kind, Publisher, Request, decode_request
+from bayesrace.transport.hold import HOLD_MISSING, HoldWatch
 
 __all__ = ["Service"]
 
@@ -45,6 +46,10 @@ class Service:
         """Serves requests about weights, where the controller takes any."""
         self._events = Publisher(session, EVENT, name, "controller", waits=False)
         self._heartbeat = Heartbeat(session, name, "controller")
+        self.hold = HoldWatch(session, name)
+        self._holds_lost = 0
+        self._let_go = False
+        """The car is stopped for want of its director."""
         self._text = "waiting for the plant"
         self._publishing = threading.Lock()
         self._weights_refused = 0
@@ -83,6 +88,23 @@ class Service:
             self.announce("sensor_fault", f"{fault}: {self._driver.fault_text}", {"fault": fault})
         else:
             self.announce("sensor_recovered", "the measured states are believed again", {})
+
+    def check_hold(self) -> None:
+        """Stops the car of a held run whose director is missing: until ``go``, or another run."""
+        newest, driver = self._driver.newest, self._driver
+        if newest is None:
+            return
+        if (newest.epoch, newest.run) != self.hold.run:
+            self.hold.follow((newest.epoch, newest.run))
+            if self._let_go:
+                driver.go()
+                self._let_go, self._text = False, f"run {newest.run} has begun"
+        elif self.hold.missing and driver.phase in (Phase.DRIVING, Phase.FALLBACK):
+            driver.stop()
+            self._let_go = True
+            self._holds_lost += 1
+            self._text = f"stopped: {HOLD_MISSING}"
+            self.announce("hold_lost", self._text, {})
 
     def react(self, item: Item) -> None:
         """Serves an item that is no message."""
@@ -144,6 +166,7 @@ class Service:
         if command is None:
             request.reply(False, why_not)
             return
+        self._let_go = False
         if command.command == "stop":
             self._driver.stop()
             self._text = f"stopped on request: {command.text}"
@@ -179,6 +202,7 @@ class Service:
             "shifted_plan": levels[Level.SHIFTED_PLAN],
             "brake": levels[Level.BRAKE],
             "stop": levels[Level.STOP],
+            "holds_lost": self._holds_lost,
             "raised": driver.count("failed"),
             "second_starts": driver.count("second_starts"),
             "cost_jumps": driver.count("cost_jumps"),

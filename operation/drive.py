@@ -34,6 +34,8 @@ class RunPlan:
     max_time_s: float
     lockstep: bool
     start_speed_mps: float = 0.1
+    held: bool = False
+    """The car stops unless the director is heard all the time; in real time only."""
 
 
 def run_request(track: Track, plan: RunPlan) -> RunRequest:
@@ -54,6 +56,7 @@ def run_request(track: Track, plan: RunPlan) -> RunRequest:
         laps=plan.laps,
         max_time_s=plan.max_time_s,
         actuation_timeout_s=5.0 if plan.lockstep else 0.2,
+        held=plan.held,
     )
 
 

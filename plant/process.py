@@ -43,6 +43,7 @@ from bayesrace.transport import (
     decode_request,
     open_sessions,
 )
+from bayesrace.transport.hold import HoldWatch
 
 __all__ = ["PlantProcess", "PlantSettings", "main"]
 
@@ -76,6 +77,7 @@ class PlantProcess:
         self._truths = Publisher(session, TRUTH, self.name)
         self._events = Publisher(session, EVENT, self.name, "plant")
         self._counters = RunCounters()
+        self._hold = HoldWatch(session, self.name)
         self._run: Run | None = None
         self._run_number = 0
         self._runs = 0
@@ -143,6 +145,10 @@ class PlantProcess:
                 "this plant was started for lockstep (--low-latency): "
                 "start it without to drive in real time"
             )
+        if message.held and message.lockstep:
+            return "hold-to-run is for real time (--mode realtime): lockstep waits for its director"
+        if self._settings.hold_to_run and not message.held:
+            return "only held runs here (hold_to_run): drive with --mode realtime --hold-to-run"
         if message.lockstep and not self._controller_there():
             return (
                 f"no controller for car '{self.name}': start one that connects to this plant "
@@ -164,12 +170,14 @@ class PlantProcess:
                 react=self._react,
                 beat=self._beat,
                 suspended=self._suspended,
+                hold=self._hold,
                 epoch=self._epoch,
                 delay_s=self._settings.delay_s,
                 sensors=Sensors(self._settings.noise, self._settings.seed),
             )
         except (InputError, FmuFault) as error:
             return str(error)
+        self._hold.follow((self._epoch, message.run), message.held)
         self._run_number = message.run
         self._runs += 1
         return ""
@@ -257,7 +265,7 @@ class PlantProcess:
     def _count(self) -> dict[str, Scalar]:
         return {
             "runs": self._runs,
-            "refused": self._decoder.refused,
+            "refused": self._decoder.refused + self._hold.decoder.refused,
             "overflowed": self.inbox.overflowed,
             "requests_rejected": self.inbox.requests_rejected,
             "states_sent": self._states.next_seq,

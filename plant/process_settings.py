@@ -24,4 +24,5 @@ class PlantSettings(CarSimulation):
     controller_wait_s: float = Field(
         2.0, ge=0, le=60, description="how long a lockstep run waits for a controller to appear"
     )
+    hold_to_run: bool = Field(False, description="refuse runs that are not held")
     parent_pid: int | None = Field(None, description="end when this process, the parent, ends")

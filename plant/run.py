@@ -12,6 +12,7 @@ from bayesrace.plant.car import CarRun, End, Sensors, drive_lockstep, fault_end,
 from bayesrace.plant.vehicle import Command, FmuFault, Vehicle, planned_at
 from bayesrace.realtime import SUSPENDED_S, sleep_until_ns
 from bayesrace.transport import LOCKSTEP_SPIN_S, Inbox, Item, Kind, Numbering, Publisher
+from bayesrace.transport.hold import HOLD_MISSING, HoldWatch
 
 __all__ = ["Run", "RunCounters"]
 
@@ -26,6 +27,10 @@ _LONGEST_S: Final = 0.1
 _MOST_DELAYS: Final = 64
 """Rows of ``State.actuation_delays`` that one message has room for."""
 
+_STANDING_MPS: Final = 0.02
+_STOPPING_S: Final = 10.0
+"""How long a car that is stopped may take to stand."""
+
 
 @dataclass(slots=True)
 class RunCounters:
@@ -39,6 +44,8 @@ class RunCounters:
     """Periods that the plant itself finished more than a period too late."""
     suspended: int = 0
     """Times that the process did not run for a second or more; plant time stood still meanwhile."""
+    holds_lost: int = 0
+    """Held runs whose director was missing, so that the car was stopped."""
 
 
 class _Waiting(NamedTuple):
@@ -69,6 +76,7 @@ class Run:
     """Called once a period; what it returns ends the run, too."""
     suspended: Callable[[float], None]
     """Called when the process has not run for so many seconds in real time."""
+    hold: HoldWatch
     epoch: int
     delay_s: float = 0.0
     """Added to states and to actuations."""
@@ -85,6 +93,8 @@ class Run:
         self._held: Actuation | None = None
         self._held_since_s = self._interval_s = 0.0
         self._braking: BrakingPlan | None = None
+        self._lost_s: float | None = None
+        """When the director was missing; nothing that arrives drives the car from then on."""
 
     @property
     def laps(self) -> int:
@@ -169,8 +179,11 @@ class Run:
             end = self._receive()
             if end is not None:
                 return end
+            if self._lost_s is None and self.hold.missing:
+                self._lost_s = self._car.time_s
+                self.counters.holds_lost += 1
             delays, end = self._drive_period(begin_ns, begin_ns + period_ns, seq)
-            end = end or self._car.finished()
+            end = end or self._finished()
             if end is not None and end.reason == "left_world":
                 return end  # no message could carry this state
             seq += 1
@@ -181,6 +194,16 @@ class Run:
                 return end
             if (end := self.beat()) is not None:
                 return end
+
+    def _finished(self) -> End | None:
+        """What ends the run in the state just reached; without its director, the car's standing."""
+        end = self._car.finished()
+        if self._lost_s is None or (end is not None and end.reason == "left_world"):
+            return end
+        vx_mps = float(self.simulator.x[3])
+        if abs(vx_mps) > _STANDING_MPS and self.time_s < self._lost_s + _STOPPING_S:
+            return None
+        return End("hold_lost", f"stopped to {vx_mps:.2f} m/s: {HOLD_MISSING}")
 
     def _enqueue(self, state: State, x: tuple[float, ...]) -> None:
         """Send the state when its delay is over; keep in mind when it was sampled."""
@@ -211,7 +234,7 @@ class Run:
                     continue
                 mine = (actuation.epoch, actuation.run) == (self.epoch, self.request.run)
                 if item.name != ACTUATION.name:
-                    self._braking = actuation if mine else self._braking
+                    self._braking = actuation if mine and self._lost_s is None else self._braking
                     continue
                 self.numbering.note(actuation.seq)
                 # one from the future would never grow old, and every later one would be overtaken
@@ -267,15 +290,16 @@ class Run:
 
     def _fresh(self, substep: int) -> Command:
         """The held command while the next one is not overdue; then the braking plan, or as long as
-        there is none the held command for a while, or None: brake."""
+        there is none the held command for a while, or None: brake. Without the director at once."""
         if self._held is None:
             return None
         simulator = self.simulator
         now_s = simulator.time_s + substep * simulator.step_s / simulator.substeps
         overdue_s = _OVERDUE * max(self._interval_s, simulator.step_s)
-        if now_s - self._held_since_s <= overdue_s:
+        drives = self._lost_s is None
+        if drives and now_s - self._held_since_s <= overdue_s:
             return self._held.u
         if (planned := planned_at(self._braking, now_s)) is not None:
             return planned
         age_s = now_s - self._held.decided_at_s
-        return self._held.u if age_s <= self.request.actuation_timeout_s else None
+        return self._held.u if drives and age_s <= self.request.actuation_timeout_s else None

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 from bayesrace.controller.driver import NO_STATE, Level
+from bayesrace.errors import InputError
 from bayesrace.log import LogReader
 from bayesrace.messages import TRUTH, BrakingPlan, State
 from bayesrace.operation.closed_loop import ClosedLoop
@@ -136,8 +137,11 @@ class Loss:
     end_mps: float
 
 
-def lose(out: Path, what: signal.Signals, after_s: float) -> Loss:
-    """One drive on harbour; a controller that is only paused goes on after 3 s."""
+def lose(out: Path, what: signal.Signals | None, after_s: float) -> Loss:
+    """One drive on harbour; a controller that is only paused goes on after 3 s.
+
+    Without a signal the director of a held run is lost, whose loop goes round no more.
+    """
     files, car = prepared(), "orca"
     track = files.first.track
     with ExitStack() as stack:
@@ -145,12 +149,16 @@ def lose(out: Path, what: signal.Signals, after_s: float) -> Loss:
         controllers = stack.enter_context(ExitStack())
         controllers.enter_context(system.controller(files.arguments))
         with Recorder(system.session, car, out / "run.mcap"):
-            plan = RunPlan(1, "bayesrace", 1, 60.0, lockstep=False)
+            plan = RunPlan(1, "bayesrace", 1, 60.0, lockstep=False, held=what is None)
             request = msgspec.structs.replace(run_request(track, plan), laps=0)
             system.director.start(request)
-            time.sleep(after_s)
             pid = system.children["controller"].pid
-            os.kill(pid, what)
+            if what is None:
+                with pytest.raises(InputError, match="did not end"):
+                    system.director.wait_for_end(1, after_s)
+            else:
+                time.sleep(after_s)
+                os.kill(pid, what)
             since_ns = time.monotonic_ns()
             time.sleep(3.0)
             stood_ns = time.monotonic_ns()
@@ -178,12 +186,13 @@ def lose(out: Path, what: signal.Signals, after_s: float) -> Loss:
 @pytest.mark.check
 @pytest.mark.wall_clock
 @pytest.mark.unmeasured
-@pytest.mark.parametrize("what", [signal.SIGKILL, signal.SIGHUP, signal.SIGSTOP])
+@pytest.mark.parametrize("what", [signal.SIGKILL, signal.SIGHUP, signal.SIGSTOP, None])
 @pytest.mark.parametrize("after_s", [9.0, 10.7, 12.4])
-def test_a_controller_that_is_lost_at_racing_speed(
-    tmp_path: Path, what: signal.Signals, after_s: float
+def test_a_controller_or_director_that_is_lost_at_racing_speed(
+    tmp_path: Path, what: signal.Signals | None, after_s: float
 ) -> None:
-    """Killed, its terminal closed, or paused for 3 s, after which it drives on."""
+    """A controller killed, its terminal closed, or paused for 3 s, after which it drives on; the
+    director of a held run, for good."""
     for attempt in range(3):
         out = tmp_path / str(attempt)
         out.mkdir()

@@ -5,15 +5,18 @@ import sys
 import time
 from collections import deque
 from collections.abc import Iterator
+from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
 import pytest
 
 from bayesrace.messages import Actuation, BrakingPlan, Decoder, RunRequest, State, Truth
+from bayesrace.plant.car import End
 from bayesrace.plant.run import Run, RunCounters
 from bayesrace.plant.vehicle import GuardCounters, Vehicle, open_vehicle
 from bayesrace.transport import Inbox, Item, Kind, Numbering, Publisher
+from bayesrace.transport.hold import HoldWatch
 from bayesrace.vehicles import get_car
 from tests.car_fmu import packed_car
 
@@ -87,36 +90,46 @@ def execute(
     answer: Any, delay_s: float = 0.0, flooded: bool = False
 ) -> tuple[list[State], RunCounters, GuardCounters]:
     """A run of .3 s in which a state is answered by actuations with these changes."""
-    controller, counters, simulator = Controller(answer), RunCounters(), VEHICLE
+    controller = Controller(answer)
+    counters, guarded, _ = run_with(controller, SimpleNamespace(missing=False), delay_s, flooded)
+    return controller.states, counters, guarded
+
+
+def run_with(
+    controller: Controller, hold: SimpleNamespace, delay_s: float = 0.0, flooded: bool = False
+) -> tuple[RunCounters, GuardCounters, End]:
+    counters, simulator = RunCounters(), VEHICLE
     suspensions: list[float] = []
     if flooded:
         controller.ask_again(Item(Kind.REQUEST, "status", None, 0))
     simulator.guard.counters = GuardCounters()
     start = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
-    line = {"line_x_m": 0.0, "line_y_m": 0.0, "line_heading_rad": 0.0}
     request = RunRequest(
         seq=0,
         source_time_ns=0,
         run=1,
         lockstep=False,
         x0=start,
-        **line,
+        line_x_m=0.0,
+        line_y_m=0.0,
+        line_heading_rad=0.0,
         line_left_m=1.0,
         line_right_m=1.0,
         laps=0,
         max_time_s=0.3,
         actuation_timeout_s=0.1,
+        held=True,
     )
     run = Run(
         request=request, simulator=simulator, inbox=cast(Inbox, controller),
         states=cast(Publisher[State], controller),
         truths=cast(Publisher[Truth], controller), decoder=Decoder(Actuation), counters=counters,
         numbering=Numbering(), react=controller.ask_again, beat=lambda: None, epoch=EPOCH,
-        suspended=suspensions.append, delay_s=delay_s,
+        suspended=suspensions.append, delay_s=delay_s, hold=cast(HoldWatch, hold),
     )  # fmt: skip
-    run.execute()
+    end = run.execute()
     assert len(suspensions) == counters.suspended
-    return controller.states, counters, simulator.guard.counters
+    return counters, simulator.guard.counters, end
 
 
 def test_an_answered_car_drives_and_the_delays_are_reported() -> None:
@@ -216,3 +229,30 @@ def test_plant_time_stands_still_while_the_process_does_not_run() -> None:
     assert guarded.braked < 8
     assert states[-1].time_s == pytest.approx(0.3)
     assert states[-1].x[3] > 1.0
+
+
+@pytest.mark.parametrize("planned", [True, False], ids=["plan", "no plan"])
+def test_nothing_drives_a_car_whose_director_is_missing(planned: bool) -> None:
+    """Whatever its controller sends, and though the director is there again: the run ends when the
+    car stands, by the plan from before, and not regularly, though its time is up meanwhile."""
+    hold, taken = SimpleNamespace(missing=False), []
+
+    def answer(state: State) -> list[dict[str, Any]]:
+        hold.missing = 5 <= state.seq < 8
+        plan = BrakingPlan(
+            seq=0, source_time_ns=0, epoch=EPOCH, run=1, begins_s=state.time_s, step_s=0.02,
+            d=(1.0 if state.seq >= 8 else -0.1,) * 20, delta=(0.0,) * 20,
+        )  # fmt: skip
+        taken.append(state.u_applied[0])
+        return [{"plan": plan}] if planned else [{}]
+
+    controller = Controller(answer)
+    counters, guarded, end = run_with(controller, hold)
+    assert (end.reason, counters.holds_lost) == ("hold_lost", 1)
+    assert "director" in end.text
+    assert (guarded.planned > 10) == planned
+    assert guarded.braked > 10
+    assert max(taken[3:6]) > 0.9
+    assert max(taken[8:]) <= 0.0
+    assert controller.states[-1].final
+    assert abs(controller.states[-1].x[3]) < 0.02

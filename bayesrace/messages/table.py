@@ -17,6 +17,7 @@ from bayesrace.messages.types import (
     BrakingPlan,
     Command,
     Event,
+    Hold,
     Message,
     Reply,
     RollbackRequest,
@@ -31,9 +32,9 @@ from bayesrace.messages.types import (
 
 __all__ = [
     "ACTUATION", "ALIVE", "ALIVE_SOURCES", "BRAKING", "COMMAND", "EVENT", "EVERYTHING", "HEARTBEAT",
-    "RECORDERS", "ROLE_OF", "ROLLBACK", "RUN", "SERVICES", "STATE", "STATUS", "STOP", "TELEMETRY",
-    "TOPICS", "TRUTH", "WEIGHTS", "Qos", "Role", "Service", "Source", "Topic", "car_key",
-    "is_car_name", "topic_of",
+    "HOLD", "RECORDERS", "ROLE_OF", "ROLLBACK", "RUN", "SERVICES", "STATE", "STATUS", "STOP",
+    "TELEMETRY", "TOPICS", "TRUTH", "WEIGHTS", "Qos", "Role", "Service", "Source", "Topic",
+    "car_key", "is_car_name", "topic_of",
 ]  # fmt: skip
 
 M = TypeVar("M", bound=Message)
@@ -139,8 +140,12 @@ HEARTBEAT: Final = Topic(
     "heartbeat", "bayesrace/{car}/status/{source}", Status, ("plant", "controller"), _WATCHING,
     "10 Hz", _REPORT,
 )  # fmt: skip
+HOLD: Final = Topic(
+    "hold", "bayesrace/{car}/hold", Hold, ("director",), ("plant", "controller"),
+    "20 Hz in a held run", _CONTROL,
+)  # fmt: skip
 TOPICS: Final[tuple[Topic[Any], ...]] = (
-    STATE, TRUTH, ACTUATION, BRAKING, TELEMETRY, EVENT, HEARTBEAT
+    STATE, TRUTH, ACTUATION, BRAKING, TELEMETRY, EVENT, HEARTBEAT, HOLD
 )  # fmt: skip
 
 RUN: Final = Service(

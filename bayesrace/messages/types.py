@@ -15,19 +15,20 @@ from msgspec import Meta, Struct
 
 __all__ = [
     "BRAKING_ROWS", "END_REASONS", "NOT_REPORTED", "PHASES", "SENSOR_FAULTS", "Actuation",
-    "BrakingPlan", "CarSample", "Command", "Event", "Message", "Reply", "RollbackRequest",
+    "BrakingPlan", "CarSample", "Command", "Event", "Hold", "Message", "Reply", "RollbackRequest",
     "RunRequest", "Scalar", "State", "Status", "StatusRequest", "StopRequest", "Telemetry", "Truth",
 ]  # fmt: skip
 
 END_REASONS: Final = (
     "laps", "max_time", "stopped", "controller_lost", "actuation_timeout", "left_world",
-    "interrupted", "plant_fault", "abandoned", "several_controllers",
+    "interrupted", "plant_fault", "abandoned", "several_controllers", "hold_lost",
 )  # fmt: skip
 """Why a run ended: ``reason`` in the data of the ``run_ended`` event.
 
 plant_fault: the simulated car failed, and its last good state is repeated as the final one.
 abandoned: the client that started the run was away for too long. several_controllers: at its
-regular end the run had more than one controller, so its actuations cannot be attributed."""
+regular end the run had more than one controller, so its actuations cannot be attributed.
+hold_lost: the plant stopped the car, because the director of the held run was missing."""
 
 PHASES: Final = ("idle", "running", "waiting", "ready", "driving", "fallback", "stopped")
 """Phases of a process, see :class:`Status`."""
@@ -276,7 +277,15 @@ class Event(Message, frozen=True, kw_only=True):
     data: DataMap
 
 
-class RunRequest(Message, frozen=True, kw_only=True):
+class Hold(Message, frozen=True, kw_only=True):
+    """Heartbeat of a held run's director, on ``bayesrace/{car}/hold``: without it the car stops."""
+
+    epoch: Count
+    run: Count
+    """Of the run, as in its states."""
+
+
+class RunRequest(Message, frozen=True, kw_only=True, tag=2):
     """Request on ``bayesrace/{car}/plant/run`` to start a run; the answer is a :class:`Reply`."""
 
     run: Count
@@ -297,6 +306,8 @@ class RunRequest(Message, frozen=True, kw_only=True):
     actuation_timeout_s: Annotated[float, Meta(ge=0.001, le=600.0)]
     """Lockstep: the run ends after so long without an answer. Free-running: the plant brakes when
     its newest actuation is older."""
+    held: bool
+    """In real time: the car stops when the director's :class:`Hold` is missing."""
 
 
 class StopRequest(Message, frozen=True, kw_only=True):

@@ -3,7 +3,8 @@
 ``endpoints`` says where a process listens and connects, ``credentials`` holds its certificate, and
 ``session`` opens a session with both, and with the access control that follows from the table of
 messages. ``publisher`` sends messages and counts what is lost of them, ``inbox`` is the one
-subscriber, ``requests`` sends requests and serves them; ``director`` starts and follows runs.
+subscriber, ``requests`` sends requests and serves them; ``director`` starts and follows runs, and
+``hold`` notices that it is missing.
 """
 
 from bayesrace.transport.credentials import Credentials, Member, Members

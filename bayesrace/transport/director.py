@@ -8,10 +8,12 @@ from typing import Any, Final
 from bayesrace.errors import InputError
 from bayesrace.messages import (
     EVENT,
+    HOLD,
     RUN,
     STATUS,
     STOP,
     Event,
+    Hold,
     Reply,
     RunRequest,
     Status,
@@ -19,7 +21,9 @@ from bayesrace.messages import (
     StopRequest,
 )
 from bayesrace.realtime import SUSPENDED_S, suspension
+from bayesrace.transport.hold import HOLD_PERIOD_S
 from bayesrace.transport.inbox import Inbox, Item, Kind
+from bayesrace.transport.publisher import Publisher
 from bayesrace.transport.requests import ask, count_processes, send_weights
 
 __all__ = ["Director", "RefusedError"]
@@ -46,6 +50,9 @@ class Director:
     def __init__(self, session: Any, car: str) -> None:
         self._session = session
         self._car = car
+        self._holds = Publisher(session, HOLD, car)
+        self._held: tuple[int, int] | None = None
+        self._hold_due_s = 0.0
         self.inbox = Inbox(session, car)
         self.inbox.subscribe(EVENT)
         self.inbox.watch("plant")
@@ -93,8 +100,12 @@ class Director:
                 )
 
     def start(self, request: RunRequest) -> Reply:
-        """Start a run; InputError with the plant's reason if it refuses."""
-        return _accepted("run", ask(self._session, RUN, self._car, request))
+        """Start a run, which :meth:`wait_for_end` holds if it is to be held; InputError with the
+        plant's reason if it refuses."""
+        epoch = self.status("plant").epoch if request.held else 0
+        reply = _accepted("run", ask(self._session, RUN, self._car, request))
+        self._held = (epoch, request.run) if request.held else None
+        return reply
 
     def stop(self, text: str) -> Reply:
         """End the current run."""
@@ -125,7 +136,7 @@ class Director:
         returned = False
         with self.inbox.receive_signals():
             while (left_s := deadline - time.monotonic()) > 0:
-                waits_s, begin_s = min(left_s, 1.0), time.monotonic()
+                waits_s, begin_s = min(left_s, self._hold()), time.monotonic()
                 item = self.inbox.get(waits_s)
                 if (late_s := time.monotonic() - begin_s - waits_s) > SUSPENDED_S:
                     _log.warning("%s; %s", suspension(late_s), _AFTER_SUSPENSION)
@@ -152,6 +163,18 @@ class Director:
             gone = " and ".join(f"the {one} of car '{self._car}' vanished" for one in sorted(lost))
             raise InputError(f"{gone} during run {run}")
         raise InputError(f"run {run} of car '{self._car}' did not end in {timeout_s:g} s")
+
+    def _hold(self) -> float:
+        """Holds the run, if that is due; how long the loop that follows it may wait now [s]."""
+        if self._held is None:
+            return 1.0
+        now_s = time.monotonic()
+        if now_s >= self._hold_due_s:
+            self._hold_due_s = now_s + HOLD_PERIOD_S
+            seq, now_ns, (epoch, run) = self._holds.next_seq, time.monotonic_ns(), self._held
+            hold = Hold(seq=seq, source_time_ns=now_ns, epoch=epoch, run=run)
+            self._holds.put(hold, lockstep=False)
+        return self._hold_due_s - now_s
 
     def _check_running(self, run: int) -> None:
         """InputError if the run has ended while the link to the plant was down, with its event."""

@@ -67,7 +67,10 @@ def plant(
     endpoints = _once_valid(
         network, "plant", listen=endpoint, connect=connect, low_latency=low_latency
     )
-    raise typer.Exit(main(settings(endpoints=endpoints, parent_pid=parent_pid), compiled))
+    chosen = settings(
+        endpoints=endpoints, hold_to_run=network.drive.hold_to_run, parent_pid=parent_pid
+    )
+    raise typer.Exit(main(chosen, compiled))
 
 
 @options_of(

@@ -113,11 +113,16 @@ def _print_result(analysis: "RaceAnalysis", page: Path) -> None:
 @options_of("bayesrace.operation.settings.RaceSettings", "track mode car")
 def drive(
     director: "Endpoints",
+    configuration: "Configuration",
     settings: "Given[RaceSettings]",
     laps: int = options.value("Laps to drive, the first from rest.", 2, min=1),
     max_time: float = options.value("Time limit [s].", 60.0, min=1, max=1e6, metavar="S"),
     log: Path = options.new_file("Log to write (MCAP).", default=Path("run.mcap")),
     name: str = options.CAR_NAME,
+    hold_to_run: bool = options.flag(
+        "--hold-to-run",
+        "Dead man's switch, in real time: the car stops when this command is not heard for 0.5 s.",
+    ),
 ) -> None:
     """Start a run on a plant and a controller that are already running, and record it.
 
@@ -129,7 +134,8 @@ def drive(
 
     chosen = settings()
     course = load_track(chosen.track, chosen.car.width_m)
-    plan = RunPlan(0, "manual", laps, max_time, chosen.mode == "lockstep")
+    held = hold_to_run or configuration.drive.hold_to_run
+    plan = RunPlan(0, "manual", laps, max_time, chosen.mode == "lockstep", held=held)
     end, verdict = drive_and_judge(director, chosen.car, name or chosen.car.name, course, plan, log)
     typer.echo(f"{end.text}; log: {log}\n{verdict.text}")
     if not verdict.passed:

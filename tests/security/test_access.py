@@ -34,11 +34,11 @@ class Rights(NamedTuple):
 
 RIGHTS: Final[dict[str, Rights]] = {
     "plant": Rights(
-        "state truth event/plant status/plant", "actuation braking", "*/status",
+        "state truth event/plant status/plant", "actuation braking hold", "*/status",
         "plant/run plant/stop plant/status", "alive/plant",
     ),
     "controller": Rights(
-        "actuation braking telemetry event/controller status/controller", "state", "",
+        "actuation braking telemetry event/controller status/controller", "state hold", "",
         "controller/status controller/weights controller/rollback controller/command",
         "alive/controller",
     ),
@@ -47,7 +47,7 @@ RIGHTS: Final[dict[str, Rights]] = {
         "*/status controller/weights controller/rollback",
     ),
     "director": Rights(
-        "event/race event/recorder", ALL_TOPICS,
+        "event/race event/recorder hold", ALL_TOPICS,
         "*/status plant/run plant/stop controller/weights controller/rollback controller/command",
         "", "alive/director",
     ),
