@@ -27,7 +27,7 @@ from tests.network.observer import STANDING_MPS, Journey
 from tests.network.proxy import Proxy
 from tests.programs import run, until
 from tests.security.authority import CAR, Bundles, bundles, written
-from tests.security.rig import course
+from tests.security.rig import course, secured
 
 __all__ = ["bundles", "course"]
 
@@ -263,3 +263,19 @@ def test_a_plant_may_demand_the_switch(tmp_path: Path, course: Course, bundles: 
         assert lockstep.returncode == 2
         assert "--mode realtime" in lockstep.stderr
         assert len(lockstep.stderr.strip().splitlines()) == 1
+
+
+def test_a_router_forwards_it_and_a_loop_that_ends_holds_nothing(
+    tmp_path: Path, course: Course, bundles: Bundles
+) -> None:
+    """Though the director's process lives, and its links stand; when it goes on, it is too late."""
+    with secured(tmp_path, course, bundles, router=True) as rig:
+        plan = RunPlan(1, "test", 0, 600.0, lockstep=False, held=True)
+        rig.director.start(run_request(course.track, plan))
+        with pytest.raises(InputError, match="did not end"):
+            rig.director.wait_for_end(1, 3.0)
+        time.sleep(0.7)
+        end = rig.director.wait_for_end(1, 30.0)  # holds it again, in vain
+        assert end.data["reason"] == "hold_lost"
+        assert float(str(end.data["time_s"])) > 3.0
+        assert rig.count("controller", "holds_lost") == {"holds_lost": 1}
