@@ -29,8 +29,13 @@ class HoldWatch:
         self.decoder = Decoder(HOLD.message)
         self._delay_ns = 0
         self.follow((0, 0))
-        key, handler = car_key(HOLD.key, car), in_transport_thread(self._note)
-        self._subscriber = session.declare_subscriber(key, handler)
+        self._key = car_key(HOLD.key, car)
+        self.bind(session)
+
+    def bind(self, session: Any) -> None:
+        """Listen on this session from now on."""
+        handler = in_transport_thread(self._note)
+        self._subscriber = session.declare_subscriber(self._key, handler)
 
     def follow(self, run: tuple[int, int], required: bool = False) -> None:
         """Watch another run, given by epoch and number. It is held from its first message on, or,
