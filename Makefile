@@ -25,7 +25,7 @@ PROJECT := --no-build-isolation --editable
 START := $(shell date +%s)
 TOOK = echo "make $@: $$(($$(date +%s) - $(START))) s"
 
-.PHONY: help race paper test check tools rest lint coverage bench clean
+.PHONY: help race paper test check tools rest lint coverage bench hashes release clean
 
 help:
 	@echo "make race    set up, and drive the whole comparison; leaves runs/DATE-TIME"
@@ -34,6 +34,8 @@ help:
 	@echo "make check   everything: lint, all tests, coverage; names the tools that it needs"
 	@echo "make lint    ruff, clang-format, mypy, import contracts"
 	@echo "make bench   time the compiled step beside CasADi + IPOPT"
+	@echo "make hashes  write constraints.hashed.txt, after a change of constraints.txt"
+	@echo "make release wheel, source, list of packages (SBOM) and checksums: build/release"
 	@echo "make clean   remove the virtual environment and all caches in this folder"
 
 race: $(VENV)/.ready
@@ -96,6 +98,25 @@ lint: $(VENV)/.ready-dev
 	$(BIN)/clang-format --dry-run -Werror $$(git ls-files '*.c' '*.h')
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+
+# Of the files of all platforms, no host is named.
+hashes: $(VENV)/.ready-dev
+	$(BIN)/uv pip compile --quiet --no-config --no-deps --generate-hashes --no-annotate --python-version 3.11 \
+		--custom-compile-command 'make $@' --output-file constraints.hashed.txt constraints.txt
+
+# The list is of what users install with all extras, here in an environment of its own, checked by hashes.
+RELEASE := build/release
+LISTED := build/release-env
+release: $(VENV)/.ready-dev
+	rm -rf $(RELEASE) $(LISTED)
+	$(BIN)/python -m hatchling build -d $(RELEASE)
+	$(BIN)/uv venv --quiet --no-config $(LISTED)
+	$(BIN)/uv pip install --quiet --no-config --python $(LISTED) -c constraints.hashed.txt \
+		"bayesrace[campaign,fmu,slipx,zig] @ $$(ls $(RELEASE)/*.whl)"
+	$(BIN)/cyclonedx-py environment --pyproject pyproject.toml --output-reproducible \
+		--output-file $(RELEASE)/bayesrace.cdx.json $(LISTED)
+	cp constraints.hashed.txt $(RELEASE)
+	cd $(RELEASE) && sha256sum * > SHA256SUMS
 
 clean:
 	rm -rf $(VENV) build .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache

@@ -1,6 +1,7 @@
 """A controller host needs few packages: the controller drives without any other."""
 
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -18,21 +19,71 @@ from tests.car_fmu import packed_car
 from tests.command_line import Cli, refused
 from tests.programs import ROOT, peanut
 
+UNIT = ROOT / "examples" / "systemd" / "bayesrace@.service"
+
 NEEDED = {"cffi", "cryptography", "eclipse-zenoh", "msgpack", "numpy", "pydantic", "typer"}
 NOT_NEEDED = {"casadi", "fmpy", "jinja2", "matplotlib", "mcap", "scipy"}
+
+
+def pins(name: str) -> dict[str, str]:
+    """Packages and versions of a list."""
+    found = re.findall(r"^([\w.-]+)==(\S+)", (ROOT / name).read_text(), re.MULTILINE)
+    return {re.sub(r"[-_.]+", "-", package).lower(): version for package, version in found}
+
+
+def test_the_hashes_are_of_the_constraints_and_name_no_host() -> None:
+    assert pins("constraints.hashed.txt") == pins("constraints.txt"), "run 'make hashes'"
+    text = re.sub("^#.*\n", "", (ROOT / "constraints.hashed.txt").read_text(), flags=re.MULTILINE)
+    assert re.fullmatch(r"([\w.-]+==[\w.+!-]+( \\\n    --hash=sha256:[0-9a-f]{64})+\n)+", text)
+
+
+@pytest.fixture(scope="module")
+def release(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("release")
+    made = [f"{name}={folder / part}" for name, part in (("RELEASE", "files"), ("LISTED", "env"))]
+    subprocess.run(["make", "release", *made], cwd=ROOT, check=True)
+    return folder / "files"
+
+
+@pytest.mark.check
+def test_a_release_lists_what_users_install(release: Path) -> None:
+    """And says nothing about the machine that made it."""
+    text = (release / "bayesrace.cdx.json").read_text()
+    listed = json.loads(text)
+    versions = {one["purl"].partition("@")[0]: one["version"] for one in listed["components"]}
+    known = {f"pkg:pypi/{name}": version for name, version in pins("constraints.txt").items()}
+    assert versions.items() <= known.items()
+    assert versions.keys() >= {f"pkg:pypi/{one}" for one in NEEDED | NOT_NEEDED | {"pyarrow"}}
+    assert listed["metadata"]["component"]["name"] == "bayesrace"
+    assert not [path for path in (ROOT, release, Path.home()) if str(path) in text]
+
+
+def on_a_board(environment: Path) -> str:
+    """The commands by which the unit's head installs a controller."""
+    head, _, _ = UNIT.read_text().partition("[Unit]")
+    words = "(?:sha256sum|grep|sed|python3 -m venv|/opt/bayesrace/bin/pip) .*"
+    commands = "\n".join(re.findall(f"^#   ({words}?)(?:   .*)?$", head, re.MULTILINE))
+    return commands.replace("python3", sys.executable).replace("/opt/bayesrace", str(environment))
 
 
 @pytest.mark.check
 @pytest.mark.unmeasured
 def test_the_controller_drives_with_its_own_extra_alone(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    release: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    python = str(tmp_path / "env" / "bin" / "python")
-    subprocess.run([sys.executable, "-m", "venv", tmp_path / "env"], check=True)
-    install = [python, "-m", "pip", "install", "--quiet", "--no-compile", "-c", "constraints.txt"]
-    subprocess.run([*install, "hatchling"], cwd=ROOT, check=True)
-    project = ["--no-build-isolation", f"{ROOT}[controller]"]  # as a wheel
-    subprocess.run([*install, *project], cwd=ROOT, check=True)
+    """A file whose hash differs is not installed."""
+    commands, python = on_a_board(tmp_path / "env"), str(tmp_path / "env" / "bin" / "python")
+    subprocess.run(["sh", "-ec", commands], cwd=release, check=True)
+    install = [python, "-m", "pip", "install", "--force-reinstall", "--require-hashes"]
+    right = (release / "constraints.hashed.txt").read_text()
+    cffi = re.search(r"^cffi==.*\n( .*\n)+", right, re.MULTILINE)
+    assert cffi
+    forged = re.sub("sha256:[0-9a-f]{4}", "sha256:0000", cffi[0])
+    (release / "forged.txt").write_text(right.replace(cffi[0], forged))
+    fails = subprocess.run(
+        [*install, "-c", "forged.txt", "-r", "bayesrace.txt"], cwd=release, capture_output=True
+    )
+    assert b"DO NOT MATCH THE HASHES" in fails.stderr
     listed = subprocess.run(
         [python, "-m", "pip", "list", "--format", "json"], capture_output=True, check=True
     )
