@@ -19,7 +19,7 @@ from bayesrace.errors import InputError, faults_in
 from bayesrace.files import parse_toml, read_text
 from bayesrace.messages import Role
 from bayesrace.realtime import RealtimeSettings
-from bayesrace.transport.credentials import COVERS, MEMBERS, Credentials
+from bayesrace.transport.credentials import CERTIFICATE, COVERS, MEMBERS, Credentials
 from bayesrace.transport.endpoints import (
     CONTROLLER_ENDPOINT,
     PLANT_ENDPOINT,
@@ -114,8 +114,9 @@ class TlsSettings(_Section):
         """Every certificate in the folder; InputError at one that cannot be used."""
         if self.folder is None or not self.folder.is_dir():
             return []
-        folders = sorted(one.parent for one in self.folder.glob(f"*/{MEMBERS}"))
-        return [Credentials.read(folder) for folder in folders]
+        # One of the two may have been forgotten.
+        found = (one for name in (CERTIFICATE, MEMBERS) for one in self.folder.glob(f"*/{name}"))
+        return [Credentials.read(folder) for folder in sorted({one.parent for one in found})]
 
 
 class DriveSettings(_Section):

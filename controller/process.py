@@ -12,6 +12,7 @@ import logging
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any, Final
 
 from bayesrace.controller.cycle import Cycle
@@ -103,8 +104,9 @@ class ControllerProcess:
         inbox = self.inbox = Inbox(session, self.name)
         self._decoder = inbox.subscribe(STATE, newest=NEWEST)
         self._service = Service(
-            session, inbox, self.name, settings.rate_hz, self._driver, self._counters
-        )
+            session, inbox, self.name, settings.rate_hz, self._driver, self._counters,
+            partial(inbox.presence, settings.endpoints, "plant"),
+        )  # fmt: skip
         self._weights: WeightUpdateManager | None = None
         self._adoption: Adoption | None = None
         if controller.port is not None:

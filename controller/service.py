@@ -36,12 +36,14 @@ class Service:
         rate_hz: float,
         driver: Driver,
         counters: Callable[[], Mapping[str, Scalar]],
+        presence: Callable[[], Mapping[str, Any]],
     ) -> None:
-        """``counters``: counts of the loop, for each status."""
+        """``counters``: counts of the loop, for each status; ``presence``: as :class:`Inbox`'s."""
         self._rate_hz = rate_hz
         self._driver = driver
         self._controller = driver.controller
         self._counters = counters
+        self._presence = presence
         self.weights: WeightUpdateManager | None = None
         """Serves requests about weights, where the controller takes any."""
         self._events = Publisher(session, EVENT, name, "controller", waits=False)
@@ -139,6 +141,7 @@ class Service:
             state_age_s=age_s,
             delay_s=driver.delay_s,
             counters=self._count(),
+            **self._presence(),
         )
 
     def _words(self) -> str:

@@ -5,18 +5,27 @@ does not say why there is no link, so each endpoint is tried here as Zenoh tries
 and a handshake with this machine's certificate.
 """
 
+import itertools
 import socket
-from collections.abc import Iterator
+import time
+from collections.abc import Collection, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from typing import Final, NamedTuple
+from pathlib import Path
+from typing import Any, Final, NamedTuple
 
-from bayesrace.configuration import Configuration, TlsSettings
+from bayesrace.configuration import Configuration, NetworkSettings, TlsSettings
 from bayesrace.errors import InputError
-from bayesrace.messages import Role
+from bayesrace.messages import STATUS, Role, Status, StatusRequest, car_key
 from bayesrace.operation.lifecycle import SOURCES, find
-from bayesrace.transport import Credentials, Endpoints, open_session
-from bayesrace.transport.credentials import CERTIFICATE_EXPIRED, CERTIFICATE_NOT_YET, NEWEST_LIST
-from bayesrace.transport.endpoints import Address, address_of
+from bayesrace.transport import Credentials, Endpoints, ask_all, open_session
+from bayesrace.transport.credentials import (
+    CERTIFICATE_EXPIRED,
+    CERTIFICATE_NOT_YET,
+    NEWEST_LIST,
+    calendar,
+)
+from bayesrace.transport.director import apart
+from bayesrace.transport.endpoints import Address, address_of, unreachable
 from bayesrace.transport.session import zenoh_config
 
 __all__ = ["Check", "check_configuration", "examine", "probe"]
@@ -26,6 +35,9 @@ _ROLES: Final[tuple[Role, ...]] = (
     "director", "learning", "viewer", "controller", "plant", "router"
 )  # fmt: skip
 """In the order in which a certificate of this machine is tried."""
+
+_CLOCK_S: Final = 3600.0
+"""By so much may clocks differ."""
 
 _CONNECT_S: Final = 1.0
 _REFUSAL_S: Final = 0.2
@@ -40,8 +52,9 @@ _OTHER_AUTHORITY: Final = (
 )
 _WE_REFUSE: Final = {
     CERTIFICATE_EXPIRED: "has a certificate that has expired: renew it there with 'bayesrace certs "
-    "add NAME --renew'",
-    CERTIFICATE_NOT_YET: "has a certificate that is not valid yet: set the clocks of both machines",
+    "add NAME --renew', or set the clock here, which says {now}",
+    CERTIFICATE_NOT_YET: "has a certificate that is not valid yet: set the clock here, which says "
+    "{now}, or there",
     **dict.fromkeys(
         (62, 64),
         "has a certificate for other hosts: connect by a name that is in it, or renew it with "
@@ -54,8 +67,8 @@ _THEY_REFUSE: Final = {
         ("UNKNOWN_CA", "BAD_CERTIFICATE", "DECRYPT_ERROR"),
         f"refuses certificate '{{name}}'; its own is {_OTHER_AUTHORITY}",
     ),
-    "EXPIRED": "refuses certificate '{name}' as expired: renew it with 'bayesrace certs add {name} "
-    "--renew', or set the clocks of both machines",
+    "EXPIRED": "refuses certificate '{name}' as expired or not valid yet, and by the clock here, "
+    "{now}, it is valid until {ends}: set the clock there, or here",
     **dict.fromkeys(("WRONG_VERSION", "EOF"), _NO_TLS),
 }
 """Part of OpenSSL's reason for the end of a handshake, to what is said of it."""
@@ -103,6 +116,8 @@ def examine(configuration: Configuration) -> Iterator[Check]:
     elif not certificates:
         yield Check(False, f"no certificates in {configuration.tls.folder}: 'bayesrace certs add'")
         return
+    else:
+        yield from _director(configuration.tls.folder, certificates)
     own = _chosen(certificates)
     if certificates and own is None:
         return
@@ -118,9 +133,10 @@ def examine(configuration: Configuration) -> Iterator[Check]:
     faults = {one: text for one, text in zip(endpoints.connect, found, strict=True) if text}
     for endpoint in endpoints.connect:
         yield Check(endpoint not in faults, faults.get(endpoint, f"{endpoint} answers"))
+    yield from (Check(False, why) for why in filter(None, map(unreachable, faults)))
     there = tuple(one for one in endpoints.connect if one not in faults)
     if there:
-        yield from _cars(endpoints.model_copy(update={"connect": there}), own)
+        yield from _cars(endpoints.model_copy(update={"connect": there}), own, configuration)
 
 
 def _certificate(one: Credentials) -> Check:
@@ -133,18 +149,32 @@ def _certificate(one: Credentials) -> Check:
     return Check(True, f"certificate '{one.name}': {one.member.role}, {car}")
 
 
+def _director(folder: Path, certificates: list[Credentials]) -> Iterator[Check]:
+    """Says that there is none of a director; on the machine that makes them, that is a fault."""
+    if not any(one.member and one.member.role == "director" for one in certificates):
+        yield Check(
+            not (folder / "authority").is_dir(),
+            f"no director's certificate in {folder}: 'bayesrace drive', 'stop' and 'go' need one: "
+            "'bayesrace certs add director --role director'",
+        )
+
+
 def _chosen(certificates: list[Credentials]) -> Credentials | None:
     """The one to try the links with: that which may do most."""
     by_role = {one.member.role: one for one in certificates if one.member is not None}
     return next((by_role[role] for role in _ROLES if role in by_role), None)
 
 
-def _cars(endpoints: Endpoints, own: Credentials | None) -> Iterator[Check]:
-    """Whether the other ends let this machine's certificate in, and which cars there are."""
+def _cars(
+    endpoints: Endpoints, own: Credentials | None, configuration: Configuration
+) -> Iterator[Check]:
+    """Whether the other ends let this machine's certificate in, which cars there are, and what
+    their processes say of themselves."""
     role: Role = "viewer" if own is None or own.member is None else own.member.role
     try:
         with open_session(endpoints, role, reports_absence=False) as session:
             cars = find(session, endpoints, _CARS_S, endpoints.car_named(""))
+            known = {car: _statuses(session, car, present) for car, present in cars.items()}
     except InputError as error:
         yield Check(False, str(error))
         return
@@ -156,6 +186,41 @@ def _cars(endpoints: Endpoints, own: Credentials | None) -> Iterator[Check]:
         text = f"car '{car}': {' and '.join(sorted(present))}"
         absent = f"; no {' and no '.join(missing)}: {remedy}"
         yield Check(not missing, text + (absent if missing else ""))
+        if role in STATUS.clients:
+            for why in _trouble(car, known[car], configuration.network):
+                yield Check(False, why)
+
+
+def _statuses(session: Any, car: str, present: Collection[str]) -> dict[str, list[Status]]:
+    """The answers of all processes of a car, by their source."""
+    request = StatusRequest(seq=0, source_time_ns=time.monotonic_ns())
+    keys = {source: car_key(STATUS.key, car, source) for source in sorted(present)}
+    found = ask_all(session, STATUS, keys.values(), request, _CARS_S)
+    return {source: found[key].valid for source, key in keys.items()}
+
+
+def _trouble(car: str, known: dict[str, list[Status]], network: NetworkSettings) -> Iterator[str]:
+    """What the processes of a car contradict: each other, the configuration, the clock here."""
+    for source, found in known.items():
+        if not found:
+            yield f"the {source} of car '{car}' does not answer within {_CARS_S:g} s: it hangs"
+        for one in found:
+            for where in one.listens:
+                if where in network.everyone and where not in getattr(network, source):
+                    yield (
+                        f"the {source} of car '{car}' listens at {where}, which the configuration "
+                        "has for the other of the two: exchange plant and controller in it"
+                    )
+            yield from filter(None, map(unreachable, one.listens))
+            ahead_s = one.calendar_s - time.time()
+            if abs(ahead_s) > _CLOCK_S:
+                yield (
+                    f"the clock of the {source}'s machine says {calendar(one.calendar_s)}, this "
+                    f"one's {calendar()}: set the wrong one; certificates begin and end by it"
+                )
+    for pair in itertools.product(*(known.get(source, ()) for source in SOURCES)):
+        if why := apart(*pair):
+            yield f"car '{car}': {why}"
 
 
 def probe(endpoint: str, credentials: Credentials | None) -> str:
@@ -231,13 +296,14 @@ def _refused(connection: socket.socket, address: Address, credentials: Credentia
         return "" if "handshake" not in str(error) else _NO_TLS
     except ssl.SSLCertVerificationError as error:
         if text := _WE_REFUSE.get(error.verify_code):
-            return text.format(host=address.host)
+            return text.format(host=address.host, now=calendar())
         return f"has a certificate {_OTHER_AUTHORITY} ({error.verify_message})"
     except ssl.SSLError as error:
         reason = error.reason or str(error)
         known = next((text for part, text in _THEY_REFUSE.items() if part in reason), "")
         unknown = f"refuses the link ({reason.replace('_', ' ').lower()})"
-        return known.format(name=credentials.name) or unknown
+        ends = calendar(credentials.ends_s)
+        return known.format(name=credentials.name, now=calendar(), ends=ends) or unknown
     except OSError:  # it closes the connection
         return _NO_TLS
     return ""

@@ -198,7 +198,7 @@ def _connected(session: Any) -> int:
 def _tokens(session: Any, key: str, timeout_s: float) -> dict[str, set[str]]:
     found: dict[str, set[str]] = {}
     for reply in session.liveliness().get(key, timeout=timeout_s):
-        if reply.ok is not None and (place := _place(str(reply.ok.key_expr))):
+        if reply.ok is not None and (place := _place(str(reply.ok.key_expr).rpartition("/")[0])):
             found.setdefault(place.car, set()).add(place.source)
     return found
 
@@ -209,7 +209,8 @@ class _Place(NamedTuple):
 
 
 def _place(key: str) -> _Place | None:
-    """Car and source of the key of a token or heartbeat; None if the table has no such process."""
+    """Car and source of the key of a heartbeat, or of a token's without its last part; None if the
+    table has no such process."""
     parts = key.split("/")
     known = len(parts) == 4 and is_car_name(parts[1]) and parts[3] in SOURCES
     return _Place(parts[1], parts[3]) if known else None

@@ -39,7 +39,6 @@ from bayesrace.transport import (
     Numbering,
     Publisher,
     Request,
-    count_processes,
     decode_request,
     open_sessions,
 )
@@ -58,15 +57,12 @@ _SPARE_S = 2.0
 _RELINKED_S = 2.0
 """After a suspension links are there again in less."""
 
-_STATUS_S = 1.0
-"""How long a controller may take to answer before a run begins, and after it has ended."""
-
 
 class PlantProcess:
     """Serves one car's runs over an open session."""
 
     def __init__(self, session: Any, settings: PlantSettings, vehicle: Vehicle) -> None:
-        self._session, self._settings = session, settings
+        self._settings = settings
         self.name = settings.name or settings.car.name
         self._simulator = vehicle
         # Two processes started in one nanosecond on two machines must differ too.
@@ -154,7 +150,7 @@ class PlantProcess:
                 f"no controller for car '{self.name}': start one that connects to this plant "
                 "(bayesrace controller)"
             )
-        if (count := count_processes(self._session, self.name, "controller", _STATUS_S)) > 1:
+        if (count := len(self.inbox.nodes("controller"))) > 1:
             # Their actuations could not be distinguished.
             return f"{count} controllers drive car '{self.name}'; end all but one"
         try:
@@ -205,11 +201,10 @@ class PlantProcess:
         self._run = None
         if run is None:
             return
-        if end.reason in ("laps", "max_time"):
-            count = count_processes(self._session, self.name, "controller", _STATUS_S)
-            if count > 1:
-                words = f"{end.text}, but {count} controllers drove the car"
-                end = End("several_controllers", words)
+        count = len(self.inbox.nodes("controller"))
+        if end.reason in ("laps", "max_time") and count > 1:
+            words = f"{end.text}, but {count} controllers drove the car"
+            end = End("several_controllers", words)
         self._text = f"run {message.run} ended after {run.time_s:.2f} s: {end.text}"
         # A fault is the FMU's, and its last message is in the text.
         level = logging.ERROR if end.reason == "plant_fault" else logging.INFO
@@ -312,6 +307,7 @@ class PlantProcess:
             else (now_ns - self._states.sent_ns) * 1e-9,
             delay_s=self._settings.delay_s,
             counters=self._count(),
+            **self.inbox.presence(self._settings.endpoints, "controller"),
         )
 
 

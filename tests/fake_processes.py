@@ -1,8 +1,10 @@
 """Plants and controllers as far as operation sees them, in threads of the tests' own process."""
 
 import threading
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import pytest
@@ -41,12 +43,16 @@ class Fake:
     beats: bool = True
     text: str = "all is well"
     heard: list[Command] = field(default_factory=list)
+    clock_s: float = 0.0
+    """How far the clock of its machine is ahead."""
+    presence: Callable[[], dict[str, Any]] = dict
 
     def status(self, seq: int) -> Status:
         rate, age = (50.0, 0.012) if self.source == "controller" else (0.0, -1.0)
         phase = "driving" if self.source == "controller" else "idle"
+        here = self.presence() | {"calendar_s": time.time() + self.clock_s}
         return messages.status(
-            seq=seq, source=self.source, phase=phase, epoch=7, run=2, text=self.text,
+            seq=seq, **here, source=self.source, phase=phase, epoch=7, run=2, text=self.text,
             weights_version="v3", rate_hz=rate, state_age_s=age, delay_s=0.034, counters=COUNTERS,
         )  # fmt: skip
 
@@ -54,6 +60,9 @@ class Fake:
         role: Role = "plant" if self.source == "plant" else "controller"
         with open_session(self.endpoints, role) as session:
             inbox = Inbox(session, self.car)
+            other = "controller" if self.source == "plant" else "plant"
+            inbox.watch(other)
+            self.presence = partial(inbox.presence, self.endpoints, other)
             inbox.serve(STATUS, self.source)
             if self.source == "controller":
                 inbox.serve(COMMAND)

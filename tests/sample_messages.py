@@ -16,7 +16,7 @@ def state(seq: int = 0, **changes: Any) -> State:
 
 def status(**changes: Any) -> Status:
     """The status of a plant that waits for a run."""
-    values = {"source": "plant", "phase": "idle", "state_age_s": -1.0, "counters": {}}
+    values = {"source": "plant", "phase": "idle", "state_age_s": -1.0, "counters": {}, "seen": {}}
     return blank(Status, **(values | changes))
 
 

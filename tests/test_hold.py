@@ -124,13 +124,18 @@ def test_clocks_that_run_at_different_rates_do_not_stop_the_car(watched: Watched
         assert not watched.missing_after(0.05)
 
 
+PRESENCE = {"node": "1", "listens": (), "connects": (), "seen": {}, "calendar_s": 0.0}
+
+
 class Controller:
     """The controller's side of it: a car that answers each state, and its service."""
 
     def __init__(self, artefact: Path, clock: Clock, **settings: Any) -> None:
         law = ScriptedLaw(lambda _: StepOutput(u=np.array([0.5, 0.0]), plan_u=NO_PLAN))
         self.driver = scripted_driver(artefact, law, **settings)
-        self.service = Service(MagicMock(), MagicMock(), "orca", 50.0, self.driver, dict)
+        self.service = Service(
+            MagicMock(), MagicMock(), "orca", 50.0, self.driver, dict, lambda: PRESENCE
+        )
         self._watched = Watched(clock)
         self.service.hold = self._watched.watch
         self._seq = 0

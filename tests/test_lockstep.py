@@ -20,10 +20,9 @@ import pytest
 
 from bayesrace.errors import InputError
 from bayesrace.log import LogReader
-from bayesrace.messages import ACTUATION, EVENT, STATE, STATUS, TELEMETRY
+from bayesrace.messages import ACTUATION, EVENT, STATE, TELEMETRY
 from bayesrace.recorder import Recorder
-from bayesrace.transport import Endpoints, Request, declare_service, open_session
-from tests import sample_messages as messages
+from bayesrace.transport import Endpoints, Inbox, open_session
 from tests.car_fmu import packed_car
 from tests.pursuit_rig import CONTROLLER, PATIENCE_S, PLANT, Rig, running_rig, start
 
@@ -209,15 +208,12 @@ def test_a_run_is_stopped_on_request_and_another_refused_meanwhile(rig: Rig) -> 
 
 def test_a_run_of_two_controllers_is_refused_or_no_success(rig: Rig) -> None:
     """Only the plant is connected to both: each would drive now and then."""
-    status = messages.status(source="controller", phase="waiting")
 
     @contextlib.contextmanager
     def another() -> Iterator[None]:
-        def answer(request: Request) -> None:
-            request.answer(status)
-
         with open_session(Endpoints(connect=(rig.at_plant,), low_latency=True)) as session:
-            _kept = declare_service(session, STATUS, "orca", answer, source="controller")
+            kept = Inbox(session, "orca")
+            kept.announce("controller")
             time.sleep(0.3)  # the declaration travels
             yield
 

@@ -443,7 +443,7 @@ def test_columns_hold_the_fields_of_the_messages(tmp_path: Path) -> None:
             one = driven.state(2**40, seq, x + seq, np.array([0.1, 0.2]))
             log.write(f"bayesrace/{car}/state", encode(one), 20 * seq)
     counts = {"overruns": 3, "share": 0.5}
-    status = blank(Status, source="plant", phase="idle", counters=counts)
+    status = blank(Status, source="plant", phase="idle", counters=counts, seen={})
     log.write("bayesrace/red/status/plant", encode(status), 100)
     log.close()
     beats = "source counters.overruns counters.share counters.other"

@@ -171,12 +171,14 @@ def largest(form: inspect.Type, valid: Any) -> Any:
             return largest(inner, valid)
         case inspect.StrType(max_length=int() as most):
             return "😀" * most
+        case inspect.DictType(key_type=key, value_type=inspect.StrType() as one, max_length=most):
+            return {f"{i:02}{largest(key, '')[2:]}": largest(one, "") for i in range(most or 0)}
         case inspect.DictType():
             return {f"{i:04}": 2**63 - 1 for i in range(190)} | {
                 str(i): "😀" * 2000 for i in range(9)
             }
-        case inspect.VarTupleType(max_length=int() as most):
-            return (1.0,) * most
+        case inspect.VarTupleType(item_type=one, max_length=int() as most):
+            return (largest(one, 1.0),) * most
     return valid
 
 

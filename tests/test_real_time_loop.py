@@ -49,6 +49,8 @@ class Clock:
     def monotonic(self) -> float:
         return self.now_ns * 1e-9
 
+    time = monotonic
+
     def sleep(self, duration_s: float) -> None:
         self.now_ns += round(duration_s * 1e9)
 

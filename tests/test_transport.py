@@ -218,28 +218,13 @@ def test_a_malformed_answer_does_not_hide_the_valid_ones(pair: tuple[Any, Any]) 
 
 def test_several_processes_of_one_name_are_reported(pair: tuple[Any, Any]) -> None:
     """Their messages would be mixed, in the car and in the log."""
-    status = encode(messages.status(source="controller", phase="waiting"))
-
-    def there(number: int) -> None:
-        with ExitStack() as stack:
-            for session in pair[:number]:
-                answer = partial(Request.answer_raw, data=status)
-                stack.enter_context(
-                    declare_service(session, STATUS, "orca", answer, None, "controller")
-                )
-            inboxes = [Inbox(session, "orca") for session in pair]
-            meet(*inboxes)
-            Director(pair[1], "orca").check_alone()
-
-    there(1)
-
-    def often() -> None:
-        """Beside other work an answer may come too late to count."""
-        for _ in range(20):
-            there(2)
-
+    director, inboxes = Director(pair[1], "orca"), [Inbox(session, "orca") for session in pair]
+    for number, inbox in enumerate(inboxes, 1):
+        director.check_alone()
+        inbox.announce("controller")
+        until(lambda: len(director.inbox.nodes("controller")) == number, "its token")  # noqa: B023
     with pytest.raises(InputError, match="2 processes are the controller of car 'orca'; end all"):
-        often()
+        director.check_alone()
 
 
 def test_a_request_beyond_the_limit_is_rejected_as_busy(

@@ -8,14 +8,17 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from datetime import timedelta
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
+from unittest.mock import Mock
 
 import pytest
 
+from bayesrace.errors import TransientError
 from bayesrace.messages import Role
 from bayesrace.operation import certificates
 from bayesrace.operation.certificates import add, init
-from bayesrace.transport import free_endpoint
+from bayesrace.operation.cli import processes
+from bayesrace.transport import Endpoints, free_endpoint
 from tests.network.cars import Course, Program, gentle_course
 from tests.programs import PATIENCE_S, until
 from tests.security.authority import Bundles, written
@@ -116,6 +119,18 @@ def test_an_address_that_is_not_there_yet_is_waited_for(
 
 
 # Certificates ------------------------------------------------------------------------------------
+
+
+def test_a_certificate_that_is_waited_for_is_mentioned_once(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Though the time by the clock is in the line."""
+    monkeypatch.setattr(time, "sleep", lambda _: None)
+    answers = [TransientError(f"certificate in x has expired: it is 12:0{k}") for k in range(9)]
+    network: Any = Mock()
+    network.endpoints.side_effect = [*answers, Endpoints()]
+    assert processes._once_valid(network, "plant") == Endpoints()
+    assert caplog.text.count("has expired") == 1
 
 
 @pytest.mark.parametrize(

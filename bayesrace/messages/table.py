@@ -161,7 +161,7 @@ STATUS: Final = Service(
     "status", "bayesrace/{car}/{source}/status", StatusRequest, Status, ("plant", "controller"),
     ("plant", *_WATCHING), 5.0, shared=True,
 )  # fmt: skip
-"""The plant asks how many controllers there are."""
+"""The plant's certificate may ask for 'bayesrace doctor' on its machine."""
 WEIGHTS: Final[Service[Message, Reply]] = Service(
     "weights", "bayesrace/{car}/controller/weights", None, Reply, ("controller",),
     ("learning", "director"), 20.0,
@@ -180,8 +180,9 @@ SERVICES: Final[tuple[Service[Any, Any], ...]] = (
     RUN, STOP, STATUS, WEIGHTS, ROLLBACK, COMMAND
 )  # fmt: skip
 
-ALIVE: Final = "bayesrace/{car}/alive/{source}"
-"""Liveliness token of a process, which everyone may see."""
+ALIVE: Final = "bayesrace/{car}/alive/{source}/*"
+"""Liveliness tokens, which everyone may see: each process has one, with the id of its session in
+place of the last part. Two processes of one name are two tokens."""
 ALIVE_SOURCES: Final[tuple[Source, ...]] = ("plant", "controller", "director")
 """Who has one."""
 

@@ -63,6 +63,7 @@ def _vector(*names: str, rows: int | None = None) -> Meta:
 Count = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 Signed = Annotated[int, Meta(ge=-(2**31), le=2**31 - 1)]
 Seconds = Annotated[float, Meta(ge=0.0, le=1e9)]
+Calendar = Annotated[float, Meta(ge=0.0, le=1e11)]
 Delay = Annotated[float, Meta(ge=0.0, le=1e3)]
 Number = Annotated[float, Meta(ge=-1e6, le=1e6)]
 Width = Annotated[float, Meta(ge=0.0, le=1e3)]
@@ -349,7 +350,7 @@ class Reply(Message, frozen=True, kw_only=True):
     data: DataMap
 
 
-class Status(Message, frozen=True, kw_only=True, tag=2):
+class Status(Message, frozen=True, kw_only=True, tag=3):
     """State of a process, on ``bayesrace/{car}/status/{source}`` at 10 Hz and on request."""
 
     source: Annotated[str, _one_of(("plant", "controller"))]
@@ -373,3 +374,17 @@ class Status(Message, frozen=True, kw_only=True, tag=2):
     """Controller: the measured delay, which it predicts over; plant: the delay set to be added."""
     counters: DataMap
     """All counters since the process started."""
+    node: Short
+    """Id of the process's session."""
+    listens: Annotated[tuple[Short, ...], Meta(max_length=8)]
+    """Endpoints that it listens on, as it was started with them, ..."""
+    connects: Annotated[tuple[Short, ...], Meta(max_length=8)]
+    """... and those that it connects to."""
+    seen: Annotated[
+        Mapping[Annotated[str, Meta(max_length=40)], Short],
+        Meta(max_length=16, extra_json_schema={"properties": {}}),
+    ]
+    """Plant: the controllers of its car that it sees; controller: the plants. Id of the session to
+    the other end of its link, and the name in the certificate there, if it has one."""
+    calendar_s: Calendar
+    """Calendar time of its machine [s since 1970]."""

@@ -28,8 +28,8 @@ if TYPE_CHECKING:
 
 __all__ = [
     "AUTHORITY", "CERTIFICATE", "CERTIFICATE_EXPIRED", "CERTIFICATE_NOT_YET", "COVERS", "EVERY_CAR",
-    "KEY", "MEMBERS", "NEWEST_LIST", "Credentials", "Member", "Members", "Watch", "check_private",
-    "watching",
+    "KEY", "MEMBERS", "NEWEST_LIST", "Credentials", "Member", "Members", "Watch", "calendar",
+    "check_private", "watching",
 ]  # fmt: skip
 
 _log = logging.getLogger("bayesrace.links")
@@ -65,10 +65,8 @@ _interrupting: Final = threading.Lock()
 until the process, which has not ended, opens another session."""
 
 _COPY: Final = "copy the folder again, as 'bayesrace certs' wrote it"
-_UNUSABLE: Final = {
-    CERTIFICATE_EXPIRED: "has expired: renew it with 'bayesrace certs add NAME --renew'",
-    CERTIFICATE_NOT_YET: "is not valid yet: set the clock of this machine",
-}
+_ANY_TIME: Final = 0x200000
+"""OpenSSL's X509_V_FLAG_NO_CHECK_TIME, which Python's module ssl does not name."""
 
 
 class Member(BaseModel):
@@ -331,6 +329,11 @@ def check_private(key: Path) -> None:
         raise InputError(f"others can read the private key {key}: chmod 600 {key}")
 
 
+def calendar(time_s: float | None = None) -> str:
+    """A calendar time in words; None: now, by this machine's clock."""
+    return time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(time_s))
+
+
 def _context(folder: Path, server: bool) -> "ssl.SSLContext":
     """What one end of a link with the certificate in that folder has; both ends are checked."""
     import ssl  # 1.4 MB, which a process without certificates does not need
@@ -353,7 +356,8 @@ def _verified(folder: Path) -> tuple[str, float]:
         raise InputError(
             f"{folder}: certificate, key and authority do not fit ({reason}): {_COPY}"
         ) from None
-    # The server judges; a certificate may be for clients alone.
+    # The server judges, but for the times; a certificate may be for clients alone.
+    server.verify_flags |= _ANY_TIME
     client.check_hostname, client.verify_mode = False, ssl.CERT_NONE
     to_server, to_client = ssl.MemoryBIO(), ssl.MemoryBIO()
     one = server.wrap_bio(to_server, to_client, server_side=True)
@@ -364,10 +368,17 @@ def _verified(folder: Path) -> tuple[str, float]:
                 with suppress(ssl.SSLWantReadError):
                     end.do_handshake()
     except ssl.SSLCertVerificationError as error:
-        if why := _UNUSABLE.get(error.verify_code):
-            raise TransientError(f"certificate in {folder} {why}") from None
         why = f"is not of the authority in {AUTHORITY} ({error.verify_message}): {_COPY}"
         raise InputError(f"certificate in {folder} {why}") from None
     found = one.getpeercert() or {}
     subject = {str(pair[0]): str(pair[1]) for group in found["subject"] for pair in group}
-    return subject["commonName"], ssl.cert_time_to_seconds(str(found["notAfter"]))
+    begins_s = ssl.cert_time_to_seconds(str(found["notBefore"]))
+    ends_s = ssl.cert_time_to_seconds(str(found["notAfter"]))
+    if not begins_s <= (now_s := time.time()) < ends_s:
+        raise TransientError(
+            f"certificate in {folder} {'has expired' if now_s > begins_s else 'is not valid yet'}: "
+            f"it counts from {calendar(begins_s)} to {calendar(ends_s)}, and the clock of this "
+            f"machine says {calendar(now_s)}: set the clock if that is wrong, or renew it with "
+            "'bayesrace certs add NAME --renew'"
+        )
+    return subject["commonName"], ends_s

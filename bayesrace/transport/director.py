@@ -24,15 +24,19 @@ from bayesrace.realtime import SUSPENDED_S, suspension
 from bayesrace.transport.hold import HOLD_PERIOD_S
 from bayesrace.transport.inbox import Inbox, Item, Kind
 from bayesrace.transport.publisher import Publisher
-from bayesrace.transport.requests import ask, count_processes, send_weights
+from bayesrace.transport.requests import ask, send_weights
 
-__all__ = ["Director", "RefusedError"]
+__all__ = ["Director", "RefusedError", "apart"]
 
 _log = logging.getLogger("bayesrace.director")
+
+_ALONE: Final = "end all but one, or give each car a name of its own (--name)"
 
 _AFTER_SUSPENSION: Final = (
     "a run in real time goes on, one in lockstep has to be started again if links have expired"
 )
+_LOOK_S: Final = 0.1
+"""Time between two looks whether processes see each other."""
 
 
 class RefusedError(InputError):
@@ -42,6 +46,27 @@ class RefusedError(InputError):
         super().__init__(f"{what} refused: {reply.text}")
         self.reply = reply
         """Its ``data`` has the numbers of the text."""
+
+
+def apart(plant: Status, controller: Status) -> str:
+    """Why a run would not be one of these two, with the remedy; empty if each sees the other, and
+    nobody else of its kind."""
+    pair, blind = ((plant, controller), (controller, plant)), []
+    for one, other in pair:
+        if strangers := [end for node, end in one.seen.items() if node != other.node]:
+            return (
+                f"the {one.source} sees another {other.source} ({', '.join(strangers)}) beside "
+                f"that at {', '.join(other.listens)}: {_ALONE}"
+            )
+        if other.node not in one.seen:
+            blind.append(f"the {one.source} does not see the {other.source}")
+    if not blind:
+        return ""
+    return (
+        f"{', '.join(blind)}: the controller connects to {', '.join(controller.connects)}, the "
+        f"plant listens at {', '.join(plant.listens)}: correct the controller's --endpoint or "
+        "[network] plant, or ask 'bayesrace doctor' on its machine what is between them"
+    )
 
 
 class Director:
@@ -61,7 +86,8 @@ class Director:
         self.inbox.announce("director")
 
     def wait_for(self, sources: Collection[str], timeout_s: float) -> None:
-        """Wait until these processes are present and know this one's subscriptions."""
+        """Wait until these processes are present, see each other, and know this one's
+        subscriptions; InputError if they do not in time."""
         deadline = time.monotonic() + timeout_s
         with self.inbox.receive_signals():
             while missing := set(sources) - self.inbox.alive:
@@ -73,8 +99,14 @@ class Director:
                     )
                 _raise_on_signal(self.inbox.get(left_s))
         # A process that answers a request knows all that was declared before it.
-        for source in sources:
-            self.status(source)
+        while True:
+            known = {source: self.status(source) for source in sources}
+            why = apart(known["plant"], known["controller"]) if len(known) > 1 else ""
+            if not why:
+                return
+            if time.monotonic() > deadline:
+                raise InputError(f"car '{self._car}': {why}")
+            time.sleep(_LOOK_S)
 
     def wait_until_gone(self, source: str, timeout_s: float) -> None:
         """Wait until the liveliness token of a process that has ended is gone."""
@@ -93,10 +125,9 @@ class Director:
         Nothing distinguishes their messages: each would drive, or be driven, now and then.
         """
         for source in ("plant", "controller"):
-            if (count := count_processes(self._session, self._car, source)) > 1:
+            if (count := len(self.inbox.nodes(source))) > 1:
                 raise InputError(
-                    f"{count} processes are the {source} of car '{self._car}'; end all but one, or "
-                    "give each car a name of its own (--name)"
+                    f"{count} processes are the {source} of car '{self._car}'; {_ALONE}"
                 )
 
     def start(self, request: RunRequest) -> Reply:

@@ -18,7 +18,7 @@ from bayesrace.transport.credentials import Credentials
 __all__ = [
     "CONTROLLER_ENDPOINT", "PLANT_ENDPOINT", "Address", "Endpoint", "Endpoints", "LinkLimits",
     "ZenohSettings", "address_of", "check_descriptors", "free_endpoint", "leaves",
-    "private_endpoints",
+    "private_endpoints", "unreachable",
 ]  # fmt: skip
 
 PLANT_ENDPOINT: Final = "tcp/127.0.0.1:7447"
@@ -95,6 +95,23 @@ def address_of(endpoint: str) -> Address:
         return Address(protocol=match["local"], host=match["path"])
     host = match["host"].strip("[]")
     return Address(protocol=match["protocol"], host=host, port=int(match["port"]))
+
+
+def unreachable(endpoint: str) -> str:
+    """Why no other machine reaches what listens there, by a name that is loopback on this one, with
+    the remedy; empty otherwise."""
+    address = address_of(endpoint)
+    found: set[str] = set()
+    with suppress(OSError):
+        if not address.loopback:
+            found = {str(one[4][0]) for one in socket.getaddrinfo(address.host, address.port)}
+    if not found or any(not ipaddress.ip_address(one).is_loopback for one in found):
+        return ""
+    return (
+        f"{endpoint}: '{address.host}' is {', '.join(sorted(found))} on this machine, which no "
+        f"other one reaches: listen at {address.protocol}/0.0.0.0:{address.port} (plant: "
+        "--endpoint, controller: --listen), or correct the name in /etc/hosts"
+    )
 
 
 def _encodes(host: str) -> bool:

@@ -23,6 +23,7 @@ import zenoh
 
 from bayesrace.messages import ALIVE, Decoder, Message, Service, Topic, car_key
 from bayesrace.processes import catching_signals
+from bayesrace.transport.endpoints import Endpoints
 from bayesrace.transport.requests import Request, declare_service, in_transport_thread
 
 __all__ = ["LOCKSTEP_SPIN_S", "NEWEST", "POLL_S", "Inbox", "Item", "Kind"]
@@ -31,6 +32,9 @@ M = TypeVar("M", bound=Message)
 
 _CAPACITY: Final = 10_000
 """Items that wait at most; a thread this far behind is broken, and memory must not follow it."""
+
+_NODES: Final = 16
+"""Processes of one source that are told apart at most."""
 
 _REQUESTS: Final = 16
 """Requests that wait at most, urgent and other ones, and that share an answer; more are rejected,
@@ -82,7 +86,7 @@ class Item(NamedTuple):
     received_ns: int
     """Own monotonic clock on arrival."""
     key: str = ""
-    """Key of a token, or of a message from the queue."""
+    """Key of a token, without the session's id, or of a message from the queue."""
 
 
 class _Channel(NamedTuple):
@@ -114,7 +118,12 @@ class Inbox:
         self._stamping = False
         self._queue_was_last = False
         self.alive: set[str] = set()
-        """Sources whose liveliness token is there, as of the items taken so far."""
+        """Sources of which a liveliness token is there, as of the items taken so far."""
+        self._nodes: dict[str, frozenset[str]] = {}
+        """Ids of the sessions that have one now, by its key."""
+        self._node = ""
+        self._seen: dict[str, str] = {}
+        """Those of :meth:`presence`, with the other ends of their links."""
         self._lock = threading.Lock()
         """Of the following, which the transport's threads change, too."""
         self._urgent: deque[Item] = deque()
@@ -178,16 +187,28 @@ class Inbox:
 
     def announce(self, source: str) -> None:
         """Declare this process's liveliness token: last, when everything else is in place."""
-        key = self._key(ALIVE, source)
-        self._declare(lambda: self._session.liveliness().declare_token(key))
+
+        def declare() -> Any:
+            self._node = str(self._session.info.zid())
+            key = self._key(ALIVE, source).replace("*", self._node)
+            return self._session.liveliness().declare_token(key)
+
+        self._declare(declare)
 
     def watch(self, source: str = "*") -> None:
-        """Receive the appearance and disappearance of processes, those present now included."""
+        """Receive the appearance of the first process of each source, and the disappearance of the
+        last one; those present now included."""
 
         def on_token(sample: Any) -> None:
-            kind = Kind.ALIVE if sample.kind == zenoh.SampleKind.PUT else Kind.GONE
-            key = str(sample.key_expr)
-            self._offer(kind, key.split("/")[-1] if source == "*" else source, None, key)
+            key, _, node = str(sample.key_expr).rpartition("/")
+            with self._lock:
+                before = self._nodes.get(key, frozenset())
+                now = before - {node} if sample.kind == zenoh.SampleKind.DELETE else before | {node}
+                if len(now) <= _NODES:
+                    self._nodes[key] = now
+                if bool(before) != bool(now):
+                    kind = Kind.ALIVE if now else Kind.GONE
+                    self._offer(kind, key.rpartition("/")[2], None, key)
 
         watched, handler = self._key(ALIVE, source), in_transport_thread(on_token)
         self._declare(
@@ -200,11 +221,31 @@ class Inbox:
         self._channels.clear()
         for source in self.alive:
             self._offer(Kind.GONE, source, None)
+        with self._lock:
+            self._nodes.clear()
         self._declared = [declare() for declare in self._declarations]
 
     def _declare(self, declare: Callable[[], Any]) -> None:
         self._declarations.append(declare)
         self._declared.append(declare())
+
+    def nodes(self, source: str) -> frozenset[str]:
+        """Ids of the sessions that are there now as a source that is watched."""
+        return self._nodes.get(self._key(ALIVE, source).removesuffix("/*"), frozenset())
+
+    def presence(self, endpoints: Endpoints, other: str) -> dict[str, Any]:
+        """Fields of this process's :class:`~bayesrace.messages.Status`: where it is, and who it
+        sees of the source ``other``, which it watches."""
+        if (nodes := self.nodes(other)) != self._seen.keys():
+            # Zenoh 1.10.2 panics where it is asked for the ends of low-latency links.
+            links = () if endpoints.low_latency else self._session.info.links()
+            ends = {str(one.zid): f"{one.dst} {one.auth_identifier or ''}"[:200] for one in links}
+            self._seen = {node: ends.get(node, "").strip() for node in sorted(nodes)}
+        here = {"listens": endpoints.listen, "connects": endpoints.connect}
+        return {
+            "node": self._node, "seen": self._seen, "calendar_s": time.time(),
+            **{name: tuple(one[:200] for one in some[:8]) for name, some in here.items()},
+        }  # fmt: skip
 
     def receive_signals(self) -> AbstractContextManager[None]:
         """For the block, SIGINT and SIGTERM arrive as items; no effect off the main thread."""

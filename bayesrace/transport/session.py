@@ -47,7 +47,13 @@ from bayesrace.transport.credentials import (
     Watch,
     watching,
 )
-from bayesrace.transport.endpoints import Endpoints, address_of, check_descriptors, leaves
+from bayesrace.transport.endpoints import (
+    Endpoints,
+    address_of,
+    check_descriptors,
+    leaves,
+    unreachable,
+)
 from bayesrace.transport.links import Links
 from bayesrace.transport.requests import in_transport_thread
 
@@ -283,6 +289,8 @@ def open_sessions(
             "INSECURE: links by %s are open to everyone in that network, who could drive the car; "
             "see docs/security.md", ", ".join(endpoints.exposed),
         )  # fmt: skip
+    for why in filter(None, map(unreachable, endpoints.listen)):
+        _log.warning("%s", why)
     failure = RestartError if role in _SERVERS else InputError
     sessions = Sessions(endpoints, role)
     with (

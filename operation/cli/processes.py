@@ -153,9 +153,9 @@ def _once_valid(network: "Configuration", role: "Role", **where: Any) -> "Endpoi
             text, faults = said, faults + 1
             if not said or faults > _COPYING:
                 raise
-        if text != said:
+        if (fault := text.partition(": ")[0]) != said:  # what follows has the time in it
             _log.warning("%s; this waits until then", text)
-        said = text
+        said = fault
         time.sleep(1.0)
 
 

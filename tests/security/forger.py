@@ -50,7 +50,7 @@ def forgeries(car: str, epoch: int, run: int) -> Iterator[tuple[str, bytes]]:
     state = blank(State, run=run, epoch=epoch, x=(1.0, 1.0, 0.0, 3.0, 0.0, 0.0, 0.0))
     actuation = blank(Actuation, run=run, epoch=epoch, u=(1.0, 5.0))
     end = blank(Event, run=run, source="plant", kind="run_ended", data={"reason": "laps"})
-    status = blank(Status, source="plant", phase="idle", epoch=epoch, run=run, counters={})
+    status = blank(Status, source="plant", phase="idle", epoch=epoch, run=run, counters={}, seen={})
     keys = [
         car_key(STATE.key, car), car_key(ACTUATION.key, car), car_key(EVENT.key, car, "plant"),
         car_key(HEARTBEAT.key, car, "plant"),

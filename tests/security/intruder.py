@@ -36,7 +36,9 @@ SERVICE_KEYS: Final = tuple(
     )
 )  # fmt: skip
 ALIVE_KEYS: Final = tuple(
-    ALIVE.format(car=car, source=source) for car in _CARS for source in ALIVE_SOURCES
+    ALIVE.format(car=car, source=source).replace("*", "1")
+    for car in _CARS
+    for source in ALIVE_SOURCES
 )
 KEYS: Final = (*TOPIC_KEYS, *SERVICE_KEYS, *ALIVE_KEYS, f"bayesrace/{CAR}/other", "elsewhere")
 

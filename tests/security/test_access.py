@@ -35,12 +35,12 @@ class Rights(NamedTuple):
 RIGHTS: Final[dict[str, Rights]] = {
     "plant": Rights(
         "state truth event/plant status/plant", "actuation braking hold", "*/status",
-        "plant/run plant/stop plant/status", "alive/plant",
+        "plant/run plant/stop plant/status", "alive/plant/*",
     ),
     "controller": Rights(
         "actuation braking telemetry event/controller status/controller", "state hold", "",
         "controller/status controller/weights controller/rollback controller/command",
-        "alive/controller",
+        "alive/controller/*",
     ),
     "learning": Rights(
         "", "state actuation braking telemetry event/* status/*",
@@ -49,7 +49,7 @@ RIGHTS: Final[dict[str, Rights]] = {
     "director": Rights(
         "event/race event/recorder hold", ALL_TOPICS,
         "*/status plant/run plant/stop controller/weights controller/rollback controller/command",
-        "", "alive/director",
+        "", "alive/director/*",
     ),
     "viewer": Rights("", ALL_TOPICS, "*/status"),
     "nobody": Rights(),
@@ -167,7 +167,7 @@ def test_exactly_what_the_table_says_gets_through(
         "is answered": asks,
         "answers": expand(rights.answers, cars, SERVICE_KEYS),
         "is seen": expand(rights.is_seen, cars, ALIVE_KEYS),
-        "sees": expand("alive/*" if role != "nobody" else "", cars, ALIVE_KEYS),
+        "sees": expand("alive/*/*" if role != "nobody" else "", cars, ALIVE_KEYS),
     }
     got = attempt(bundles, name)
     assert {one: got[one] for one in operations} == {one: allowed[one] for one in operations}

@@ -179,7 +179,7 @@ def _of(name: str, *files: str) -> Callable[[Path, Bundles], None]:
         (_of("foreign-plant", "members.json"), "not signed by the authority"),
         (_of("controller", "key.pem"), "do not fit"),
         (_of("foreign-plant", "certificate.pem", "key.pem"), "not of the authority"),
-        (_of("expired", "certificate.pem", "key.pem"), "has expired: renew"),
+        (_of("expired", "certificate.pem", "key.pem"), "has expired: it counts from"),
     ],
 )
 def test_a_folder_that_cannot_be_used_is_refused_with_the_remedy(

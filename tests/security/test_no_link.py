@@ -164,7 +164,7 @@ def test_doctor_tries_everything(cli: Cli, bundles: Bundles, tmp_path: Path) -> 
     plant_at, controller_at = free_endpoint("tls"), free_endpoint("tls")
     config = written(tmp_path, bundles, plant_at, controller_at)
     with open_session(bundles.endpoints("plant", listen=(plant_at,)), "plant") as session:
-        token = session.liveliness().declare_token(f"bayesrace/{CAR}/alive/plant")
+        token = session.liveliness().declare_token(f"bayesrace/{CAR}/alive/plant/1")
         found = cli("doctor", "--config", config)
         token.undeclare()
     assert found.code == 1
@@ -196,7 +196,7 @@ def test_an_older_list_of_members_is_said_by_commands_and_doctor(cli: Cli, tmp_p
     config = written(tmp_path, Bundles(certs), where, where)
     older = Endpoints(listen=(where,), credentials=Credentials.read(folder))
     with open_session(older, "plant") as session:
-        token = session.liveliness().declare_token(f"bayesrace/{CAR}/alive/plant")
+        token = session.liveliness().declare_token(f"bayesrace/{CAR}/alive/plant/1")
         commanded = cli("status", "--timeout", "0.5", "--config", config)
         examined = cli("doctor", "--config", config)
         token.undeclare()
