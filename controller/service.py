@@ -176,7 +176,7 @@ class Service:
         else:
             self._driver.go()
             self._text = f"driving on request: {command.text}"
-        self.announce(command.command, self._text, {})
+        self.announce(command.command, self._text, request.by)
         request.reply(True, self._text)
 
     def announce(self, kind: str, text: str, data: Mapping[str, Scalar]) -> None:

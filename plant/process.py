@@ -120,13 +120,14 @@ class PlantProcess:
         message, why_not = decode_request(request)
         if message is not None:
             why_not = self._prepare(message)
+        by = request.by
         request.reply(not why_not, why_not or f"run {message.run} started")
         if why_not or self._run is None:
             _log.warning("run refused: %s", why_not)
             return
         self._text = f"run {message.run} is running"
         mode = "lockstep" if message.lockstep else "free-running"
-        self._publish_event("run_started", f"run {message.run} in {mode}", {"mode": mode})
+        self._publish_event("run_started", f"run {message.run} in {mode}", {"mode": mode, **by})
         gc.collect()
         end = self._run.execute()
         self._conclude(message, end)
@@ -241,8 +242,9 @@ class PlantProcess:
         if message is None or self._run is None:
             request.reply(False, why_not or "no run to stop")
             return None
+        of = f" of '{request.sender}'" if request.sender else ""
         request.reply(True, f"run {self._run_number} stops")
-        return End("stopped", f"stopped on request: {message.text}")
+        return End("stopped", f"stopped on request{of}: {message.text}")
 
     def _publish_event(self, kind: str, text: str, data: Mapping[str, Scalar]) -> None:
         now_ns = time.monotonic_ns()

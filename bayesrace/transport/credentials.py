@@ -55,7 +55,7 @@ CERTIFICATE_EXPIRED: Final = 10
 CERTIFICATE_NOT_YET: Final = 9
 """OpenSSL's numbers of what is wrong with a certificate."""
 
-_SOON_S: Final = 14 * 86400
+_SOON_S: Final = 14 * 86400.0
 _REMINDER_S: Final = 86400.0
 _CALENDAR_S: Final = 1.0
 """Longest time between two looks at the calendar, which somebody may set."""
@@ -113,6 +113,7 @@ class Credentials(BaseModel):
     folder: Path
     name: str = Field(description="common name in the certificate")
     ends_s: float = Field(description="calendar time of its expiry, as of time.time()")
+    soon_s: float = Field(_SOON_S, description="time before the expiry that warnings begin")
     members: Members
 
     @classmethod
@@ -128,8 +129,10 @@ class Credentials(BaseModel):
         for name in (AUTHORITY, CERTIFICATE, KEY, MEMBERS):
             read_text(folder / name, "file", _COPY)
         check_private(folder / KEY)
-        name, ends_s = _verified(folder)
-        return cls(folder=folder, name=name, ends_s=ends_s, members=_members(folder))
+        name, begins_s, ends_s = _verified(folder)
+        soon_s = min(_SOON_S, (ends_s - begins_s) / 6)
+        members = _members(folder)
+        return cls(folder=folder, name=name, ends_s=ends_s, soon_s=soon_s, members=members)
 
     def client(self) -> "ssl.SSLContext":
         """For a link to another end, whose certificate is checked."""
@@ -171,9 +174,9 @@ class Credentials(BaseModel):
             )
 
     def expires_soon(self) -> str:
-        """A warning in the last two weeks; empty before."""
+        """A warning in the last two weeks, or the last sixth of its time; empty before."""
         left_s = self.ends_s - time.time()
-        if left_s > _SOON_S:
+        if left_s > self.soon_s:
             return ""
         left = f"{left_s / 86400:.0f} days" if left_s > 2 * 86400 else f"{left_s / 3600:.1f} hours"
         return (
@@ -233,15 +236,22 @@ def watching(watch: "Watch", failure: type[InputError] = InputError) -> Iterator
 class Watch:
     """What is in the folder of a certificate while its process runs."""
 
-    def __init__(self, own: Credentials, role: Role, changed: Callable[[Members], None]) -> None:
-        """``changed`` is called with each newer list of members."""
+    def __init__(
+        self,
+        own: Credentials,
+        role: Role,
+        changed: Callable[[Members], None],
+        each_time: Callable[[], None],
+    ) -> None:
+        """``changed`` is called with each newer list of members, ``each_time`` at each look."""
         self.used = self.newest = own
         """With which the session was opened, and with which the next one can be."""
-        self._role, self._changed = role, changed
+        self._role, self._changed, self._each_time = role, changed, each_time
         self._members, self._stamps = own.members, tuple[Any, ...]()
 
     def look(self) -> None:
         """Reads it again if a file has changed; the log says what cannot be used."""
+        self._each_time()
         before, self._stamps = self._stamps, _stamps(self.used.folder)
         if before == self._stamps:
             return
@@ -345,8 +355,8 @@ def _context(folder: Path, server: bool) -> "ssl.SSLContext":
     return context
 
 
-def _verified(folder: Path) -> tuple[str, float]:
-    """Name and end of the certificate, after a handshake with itself; InputError if that fails."""
+def _verified(folder: Path) -> tuple[str, float, float]:
+    """Name, begin and end of the certificate, by a handshake with itself; else InputError."""
     import ssl  # as above
 
     try:
@@ -372,8 +382,9 @@ def _verified(folder: Path) -> tuple[str, float]:
         raise InputError(f"certificate in {folder} {why}") from None
     found = one.getpeercert() or {}
     subject = {str(pair[0]): str(pair[1]) for group in found["subject"] for pair in group}
-    begins_s = ssl.cert_time_to_seconds(str(found["notBefore"]))
-    ends_s = ssl.cert_time_to_seconds(str(found["notAfter"]))
+    begins_s, ends_s = (
+        ssl.cert_time_to_seconds(str(found[one])) for one in ("notBefore", "notAfter")
+    )
     if not begins_s <= (now_s := time.time()) < ends_s:
         raise TransientError(
             f"certificate in {folder} {'has expired' if now_s > begins_s else 'is not valid yet'}: "
@@ -381,4 +392,4 @@ def _verified(folder: Path) -> tuple[str, float]:
             f"machine says {calendar(now_s)}: set the clock if that is wrong, or renew it with "
             "'bayesrace certs add NAME --renew'"
         )
-    return subject["commonName"], ends_s
+    return subject["commonName"], begins_s, ends_s

@@ -7,6 +7,7 @@ each new link is looked at before anything is received over it, and all are when
 import logging
 import socket
 import struct
+from collections import deque
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -16,11 +17,12 @@ import zenoh
 
 from bayesrace.transport.credentials import MEMBERS, Members
 
-__all__ = ["Links"]
+__all__ = ["LINKS", "Links"]
 
 _log = logging.getLogger("bayesrace.links")
 
 _CHUNK: Final = 1 << 16
+_MOST_ACCEPTED: Final = 1000
 
 
 class _Link(NamedTuple):
@@ -39,6 +41,7 @@ class Links:
         self._links: dict[tuple[str, str], _Link] = {}
         """By own end and other end, as Zenoh writes them."""
         self._reported: set[str] = set()
+        self._accepted: deque[str] = deque(maxlen=_MOST_ACCEPTED)
 
     def on_event(self, event: Any) -> None:
         """A link that begins or ends; in the transport's thread, before messages come over it."""
@@ -56,6 +59,33 @@ class Links:
         """Closes the links of those who are not in a newer list, or do something else now."""
         self._newest = members
         self.tend()
+
+    def sender(self, query: Any) -> str:
+        """The name in the certificate of who sent a request; of a router, if it came over one.
+
+        By what the request says of itself: a member could name the session of another one that has
+        a link here, whose number it would have to know. Empty without certificates.
+        """
+        if self._begun is None:
+            return ""
+        names = {link.node: link.name for link in tuple(self._links.values())}
+        source = query.source_info
+        if source is not None and (node := str(source.source_id.zid)) in names:
+            return names[node]
+        members = self._begun.members
+        routers = [
+            one for one in names.values() if one in members and members[one].role == "router"
+        ]
+        return f"somebody at {', '.join(routers)}" if routers else "somebody"
+
+    def accepted(self, text: str) -> None:
+        """Something for the log, which the control loop does not wait for."""
+        self._accepted.append(text)
+
+    def report(self) -> None:
+        """Writes it; for another thread."""
+        while self._accepted:
+            _log.info("%s", self._accepted.popleft())
 
     def tend(self) -> None:
         """Closes links that may not be, and switches off the linger of all sockets.
@@ -84,6 +114,10 @@ class Links:
             number = self._newest.number
             _log.warning("links of '%s', who %s %s %d, are closed", name, why, MEMBERS, number)
         return False
+
+
+LINKS: Final[dict[str, Links]] = {}
+"""Those of each open session, by its number."""
 
 
 def _ends(link: Any) -> tuple[str, str]:

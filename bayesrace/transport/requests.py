@@ -22,6 +22,7 @@ from bayesrace.messages import (
     decode,
     encode,
 )
+from bayesrace.transport.links import LINKS, Links
 
 __all__ = [
     "Answers", "Request", "ask", "ask_all", "count_processes", "decisive", "declare_service",
@@ -121,6 +122,7 @@ def ask_all(
             consolidation=zenoh.ConsolidationMode.NONE,
             # A dropped request is never answered: on a loaded machine that ended a race.
             congestion_control=zenoh.CongestionControl.BLOCK,
+            source_info=zenoh.SourceInfo(session.id, 0),
         )
         for key in keys
     }
@@ -175,15 +177,35 @@ def send_rollback(session: Any, car: str, text: str, timeout_s: float | None = N
 class Request:
     """A pending request, with those that have joined it; answer it once."""
 
-    def __init__(self, service: Service[Any, Any], query: Any, max_bytes: int | None) -> None:
-        """``max_bytes``: a longer payload is not copied, which would block other threads."""
+    def __init__(
+        self,
+        service: Service[Any, Any],
+        query: Any,
+        max_bytes: int | None,
+        links: Links | None = None,
+    ) -> None:
+        """``max_bytes``: a longer payload is not copied, which would block other threads.
+
+        ``links``: of the session that it came by.
+        """
         self.service = service
+        self._links = links
         self._queries = [query]
         payload = query.payload
         self.size = 0 if payload is None else len(payload)
         """Bytes of the payload as sent."""
         fits = max_bytes is None or self.size <= max_bytes
         self.payload: bytes = payload.to_bytes() if payload is not None and fits else b""
+
+    @property
+    def sender(self) -> str:
+        """See :meth:`.Links.sender`; empty once it is answered."""
+        return self._links.sender(self._queries[0]) if self._links and self._queries else ""
+
+    @property
+    def by(self) -> dict[str, Scalar]:
+        """The sender, for the data of an event; nothing without certificates."""
+        return {"by": self.sender} if self.sender else {}
 
     def join(self, other: "Request", most: int) -> bool:
         """Let ``other`` have the same answer; False if ``most`` requests have it already."""
@@ -197,7 +219,9 @@ class Request:
         self.answer_raw(encode(message))
 
     def reply(self, accepted: bool, text: str, data: Mapping[str, Scalar] | None = None) -> None:
-        """Answer with a :class:`.Reply`."""
+        """Answer with a :class:`.Reply`; what is accepted is logged with its sender."""
+        if accepted and self._links is not None and (sender := self.sender):
+            self._links.accepted(f"{self.service.name} by '{sender}': {text}")
         self.answer(
             Reply(
                 seq=0,
@@ -240,8 +264,10 @@ def declare_service(
     For threads without an inbox. Keep what is returned; ``max_bytes`` as in :class:`Request`.
     """
 
+    links = LINKS.get(str(session.info.zid()))
+
     def on_query(query: Any) -> None:
-        on_request(Request(service, query, max_bytes))
+        on_request(Request(service, query, max_bytes, links))
 
     key = car_key(service.key, car, source)
     return session.declare_queryable(key, in_transport_thread(on_query))

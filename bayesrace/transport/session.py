@@ -54,7 +54,7 @@ from bayesrace.transport.endpoints import (
     leaves,
     unreachable,
 )
-from bayesrace.transport.links import Links
+from bayesrace.transport.links import LINKS, Links
 from bayesrace.transport.requests import in_transport_thread
 
 __all__ = [
@@ -228,7 +228,7 @@ class Sessions:
         self._endpoints, self._role, self._stack = endpoints, role, ExitStack()
         self._links: Links | None = None
         own = endpoints.credentials
-        self.watch = None if own is None else Watch(own, role, self._update)
+        self.watch = None if own is None else Watch(own, role, self._update, self._report)
         # A thread that the system treats as all others, whatever becomes of the calling one.
         self._opener = ThreadPoolExecutor(1)
         if own is not None and role in _SERVERS:
@@ -271,6 +271,10 @@ class Sessions:
     def _update(self, members: Members) -> None:
         if self._links is not None:
             self._links.update(members)
+
+    def _report(self) -> None:
+        if self._links is not None:
+            self._links.report()
 
 
 @contextmanager
@@ -366,7 +370,13 @@ def _opened(
                 for link in session.info.links():
                     links.note(link)
             links.tend()
-            yield session, links
+            number = str(session.info.zid())
+            LINKS[number] = links
+            try:
+                yield session, links
+            finally:
+                del LINKS[number]
+                links.report()
 
 
 def _not_opened(endpoints: Endpoints, error: Exception) -> InputError:

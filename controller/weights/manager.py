@@ -164,7 +164,7 @@ class WeightUpdateManager:
         in_use = f"in use from cycle {cycle} on, as number {new.number}"
         text = f"weights {new.version} {in_use}; {verdict['text']}"
         facts = {"number": new.number, "cycle": cycle, "adoption_us": self.adoption.us}
-        facts = verdict["data"] | facts
+        facts = verdict["data"] | facts | request.by
         self._announce("weights_accepted", text, facts)
         return self._kept(text, facts)
 

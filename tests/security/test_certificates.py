@@ -64,7 +64,7 @@ def test_renewed_keeps_what_is_not_given_and_revoked_never_returns(
     cli: Cli, tmp_path: Path
 ) -> None:
     cli("certs", "init")
-    cli("certs", "add", "a", "--role", "controller", "--car", "orca", "--days", "1")
+    cli("certs", "add", "a", "--role", "controller", "--car", "orca", "--days", "0.2")
     cli("certs", "add", "b", "--role", "plant")
     folder = tmp_path / "certs" / "a"
     before = Credentials.read(folder)

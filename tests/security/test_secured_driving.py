@@ -18,6 +18,7 @@ from bayesrace.log import LogReader
 from bayesrace.messages import (
     ACTUATION,
     COMMAND,
+    EVENT,
     STATE,
     STOP,
     Command,
@@ -63,7 +64,22 @@ def test_a_secured_system_is_driven_taught_and_commanded(
         assert run("status", "--json", *with_config).returncode == 0
         assert run("stop", "--run", *with_config).returncode == 0
         assert rig.end(2).data["reason"] == "stopped"
+        director, learning = ("director", "learning")
+        if router:
+            director = learning = "somebody at router"
+        done = (
+            f"run by '{director}': run 2 started", f"stop by '{director}': run 2 stops",
+            f"command by '{director}': stopped on", f"command by '{director}': driving on",
+            f"weights by '{learning}': weights",
+        )  # fmt: skip
+        until(
+            lambda: all(one in rig.plant.said() + rig.controller.said() for one in done), str(done)
+        )
         journey = rig.journey()
+    events = LogReader(rig.log).messages((EVENT,))
+    data = {entry.message.kind: entry.message.data for entry in events}
+    for kind in ("run_started", "stop", "go", "weights_accepted"):
+        assert data[kind]["by"] == (learning if kind == "weights_accepted" else director)
     assert journey.off_track_m() <= 0
 
 
