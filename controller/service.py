@@ -78,6 +78,7 @@ class Service:
             if (session := renewed()) is not None:
                 self._events.bind(session)
                 self._heartbeat.bind(session)
+                self.hold.bind(session)
         return session
 
     def report_fault(self) -> None:

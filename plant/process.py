@@ -101,7 +101,8 @@ class PlantProcess:
         while not self._stopping:
             if time.monotonic() > self._spare_s and (session := renewed()) is not None:
                 self._session = session
-                for one in (self._heartbeat, self._states, self._truths, self._events, self.inbox):
+                publishers = self._heartbeat, self._states, self._truths, self._events
+                for one in (*publishers, self._hold, self.inbox):
                     one.bind(session)
             self._beat()
             item = self.inbox.get(HEARTBEAT_S)

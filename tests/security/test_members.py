@@ -7,8 +7,10 @@ from pathlib import Path
 import pytest
 
 from bayesrace.configuration import read_configuration
+from bayesrace.errors import InputError
 from bayesrace.messages import COMMAND, STOP, Command, StopRequest, car_key, encode
 from bayesrace.operation.certificates import add, init, revoke
+from bayesrace.operation.drive import RunPlan, run_request
 from bayesrace.transport import free_endpoint
 from tests.driven import blank
 from tests.network.cars import Course, Program
@@ -136,6 +138,13 @@ def test_an_added_director_and_renewed_certificates_need_no_restart(
         until(lambda: rig.phase() == "driving", "driving")
         assert run("stop", "--run", "--config", config).returncode == 0
         assert rig.end(2).data["reason"] == "stopped"
+        plan = RunPlan(3, "test", 0, 600.0, lockstep=False, held=True)
+        rig.director.start(run_request(course.track, plan))
+        with pytest.raises(InputError, match="did not end"):  # it is held, and then not any more
+            rig.director.wait_for_end(3, 2.0)
+        until(lambda: rig.director.status("plant").phase == "idle", "the end of the held run")
+        for source in ("plant", "controller"):
+            assert rig.count(source, "holds_lost") == {"holds_lost": 1}
         for program in programs:
             assert program.process.poll() is None
             program.end()
