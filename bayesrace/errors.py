@@ -4,6 +4,7 @@ Every reader of files, messages, options and numbers raises :class:`InputError`;
 turns it into one line on stderr and exit code 2, so its message must name the thing and the remedy.
 """
 
+import errno
 import re
 from collections.abc import Collection, Iterable, Mapping
 from typing import TYPE_CHECKING, Any, Final, get_args
@@ -11,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final, get_args
 if TYPE_CHECKING:
     from pydantic import ValidationError
 
-__all__ = ["InputError", "RestartError", "TransientError", "faults_in"]
+__all__ = ["PASSING", "InputError", "RestartError", "TransientError", "faults_in"]
 
 _KINDS: Final = {
     "int": "a whole number", "float": "a number", "finite": "a finite number",
@@ -19,6 +20,13 @@ _KINDS: Final = {
     "dict": "a table", "model": "a table", "path": "a path",
 }  # fmt: skip
 """What pydantic's kinds of faults ask for, by the beginnings of their names."""
+
+
+PASSING: Final = (
+    errno.EAGAIN, errno.EDQUOT, errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM,
+    errno.ENOSPC,
+)  # fmt: skip
+"""Errors of the system that is short of something now, and may not be later."""
 
 
 class InputError(ValueError):

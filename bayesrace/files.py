@@ -47,7 +47,7 @@ def read_whole(
             data = file.read(most + 1)
     except (OSError, ValueError) as error:  # a null byte in a path is a ValueError
         reason = (isinstance(error, OSError) and error.strerror) or str(error)
-        raise InputError(f"cannot read {what} {path}: {reason}; {remedy}") from None
+        raise InputError(f"cannot read {what} {path}: {reason}; {remedy}") from error
     if len(data) > most:
         raise InputError(f"{what} {path} is longer than {most >> 20} MB; {remedy}")
     return data

@@ -1,10 +1,12 @@
 """Input that cannot be used is refused before the work, in a line that names it and the remedy."""
 
+import errno
 import os
 import resource
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import NoReturn
 
 import pytest
 
@@ -224,6 +226,24 @@ def test_too_few_descriptors_are_said_before_the_work(
     assert done.returncode == 2
     assert said in done.stderr.splitlines()[-1]
     assert "panicked" not in done.stderr
+
+
+@pytest.mark.parametrize("number", [errno.EMFILE, errno.ENOSPC, errno.EACCES])
+def test_what_the_system_is_short_of_does_not_end_a_service_for_good(
+    cli: Cli, monkeypatch: pytest.MonkeyPatch, number: int
+) -> None:
+    """Exit code 2 is not restarted."""
+    where, code = Path("settings.toml"), 2 if number == errno.EACCES else 75
+
+    def fails(*_: object) -> NoReturn:
+        raise OSError(number, os.strerror(number), str(where))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "open", fails)
+        outcome = cli("plant", "--config", where)
+    refused(outcome, "settings.toml", os.strerror(number), code=code)
+    monkeypatch.setattr("bayesrace.plant.process.main", fails)
+    refused(cli("plant"), "settings.toml", os.strerror(number), code=code)
 
 
 def test_devices_are_not_read_without_end(cli: Cli, tmp_path: Path) -> None:

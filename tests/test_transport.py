@@ -12,7 +12,7 @@ from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
-from unittest.mock import MagicMock
+from unittest.mock import MagicMock, Mock
 
 import pytest
 import zenoh
@@ -132,6 +132,18 @@ def test_an_inbox_receives_its_own_car_or_all_and_counts_what_its_queue_cannot_t
     keys = [take(every, Kind.MESSAGE).key for _ in range(3)]
     assert keys == [car_key(STATE.key, car) for car in ("two", "one", "two")]
     assert (every.overflowed, every.get()) == (1, None)
+
+
+def test_every_request_that_shares_an_answer_ends_whatever_fails() -> None:
+    """Its client waits for that, and it would keep its place."""
+    queries = [Mock(payload=None) for _ in range(3)]
+    queries[0].reply.side_effect = zenoh.ZError
+    queries[1].reply.side_effect = RuntimeError
+    first, *others = (Request(STATUS, query, None) for query in queries)
+    assert all(first.join(other, 3) for other in others)
+    with pytest.raises(RuntimeError):
+        first.answer_raw(b"")
+    assert [query.drop.call_count for query in queries] == [1, 1, 1]
 
 
 def test_requests_are_answered_and_silence_is_an_error(pair: tuple[Any, Any]) -> None:

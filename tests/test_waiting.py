@@ -1,8 +1,11 @@
 """Plant, controller and router wait for what may pass, as long as they run; each says so once."""
 
+import os
 import resource
+import shutil
 import signal
 import socket
+import subprocess
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -21,7 +24,9 @@ from bayesrace.operation.cli import processes
 from bayesrace.transport import Endpoints, free_endpoint
 from tests.network.cars import Course, Program, gentle_course
 from tests.programs import PATIENCE_S, until
-from tests.security.authority import Bundles, written
+from tests.security.authority import Bundles, bundles, written
+
+__all__ = ["bundles"]
 
 pytestmark = pytest.mark.wall_clock
 
@@ -159,6 +164,48 @@ def test_a_certificate_that_is_not_valid_now_is_waited_for(
         check_running(program, name)
     assert program.said().count(wrong) == 1
     assert "Traceback" not in program.said()
+
+
+@pytest.mark.parametrize("stays", [False, True])
+def test_a_certificate_that_is_being_copied_is_waited_for(
+    tmp_path: Path, bundles: Bundles, stays: bool
+) -> None:
+    """Its key is there, and the old certificate; if it stays so, that is refused."""
+    folder, where = tmp_path / "certs", free_endpoint("tls")
+    shutil.copytree(bundles.path("plant"), folder / "plant")
+    shutil.copy(bundles.path("controller") / "key.pem", folder / "plant" / "key.pem")
+    config = written(tmp_path, Bundles(folder), where, free_endpoint("tls"))
+    with Program(tmp_path / "said.txt", "plant", "--config", config) as program:
+        until(lambda: "do not fit" in program.said(), "a line about it")
+        if stays:
+            assert program.process.wait(PATIENCE_S) == 2
+        else:
+            shutil.copytree(bundles.path("plant"), folder / "plant", dirs_exist_ok=True)
+            check_running(program, "plant")
+    assert program.said().count("do not fit") == 1 + stays
+
+
+# The first process of a container -----------------------------------------------------------------
+
+UNSHARE: Final = ("unshare", "--pid", "--fork", "--mount-proc", "--kill-child")
+
+
+@pytest.mark.skipif(
+    subprocess.run([*UNSHARE, "true"], capture_output=True).returncode != 0,
+    reason="needs unshare and the right to make namespaces",
+)
+@pytest.mark.parametrize("name", SERVICES)
+def test_the_first_process_of_a_container_ends_while_it_waits(
+    tmp_path: Path, course: Course, name: Role
+) -> None:
+    """The system has no default action of signals for it."""
+    said = tmp_path / "said.txt"
+    with taken() as where, Program(said, *command(name, course, where), prefix=UNSHARE) as program:
+        until(lambda: IN_USE in program.said(), "a line about the endpoint")
+        outside = program.process.pid
+        (first,) = Path(f"/proc/{outside}/task/{outside}/children").read_text().split()
+        os.kill(int(first), signal.SIGTERM)
+        assert program.process.wait(PATIENCE_S) == 128 + signal.SIGTERM
 
 
 # Descriptors -------------------------------------------------------------------------------------

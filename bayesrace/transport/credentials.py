@@ -64,6 +64,8 @@ _interrupting: Final = threading.Lock()
 """Held once an expiry interrupts the process, which may have several sessions with one certificate;
 until the process, which has not ended, opens another session."""
 
+_COPYING_S: Final = 5.0
+"""So long after the last change of a folder its files may still be being copied."""
 _COPY: Final = "copy the folder again, as 'bayesrace certs' wrote it"
 _ANY_TIME: Final = 0x200000
 """OpenSSL's X509_V_FLAG_NO_CHECK_TIME, which Python's module ssl does not name."""
@@ -121,17 +123,25 @@ class Credentials(BaseModel):
         """The content of a folder; InputError naming what cannot be used.
 
         Expired, of another authority than that of the folder, with another key: all is noticed
-        here, before there is a link. TransientError: it has expired or is not valid yet.
+        here, before there is a link. TransientError: it has expired or is not valid yet, or the
+        folder has just changed, as while its files are copied one by one.
         """
         folder = folder.expanduser().absolute()
         if not folder.is_dir():
             raise InputError(f"no certificate in {folder}: make one with 'bayesrace certs add'")
-        for name in (AUTHORITY, CERTIFICATE, KEY, MEMBERS):
-            read_text(folder / name, "file", _COPY)
-        check_private(folder / KEY)
-        name, begins_s, ends_s = _verified(folder)
+        try:
+            for name in (AUTHORITY, CERTIFICATE, KEY, MEMBERS):
+                read_text(folder / name, "file", _COPY)
+            check_private(folder / KEY)
+            name, begins_s, ends_s = _verified(folder)
+            members = _members(folder)
+        except TransientError:
+            raise
+        except InputError as error:
+            if _just_changed(folder):
+                raise TransientError(str(error)) from None
+            raise
         soon_s = min(_SOON_S, (ends_s - begins_s) / 6)
-        members = _members(folder)
         return cls(folder=folder, name=name, ends_s=ends_s, soon_s=soon_s, members=members)
 
     def client(self) -> "ssl.SSLContext":
@@ -279,6 +289,14 @@ def _outlasted(watch: Watch, over: threading.Event) -> bool:
             return False
         watch.look()
     return True
+
+
+def _just_changed(folder: Path) -> bool:
+    try:
+        changed_s = max(path.stat().st_ctime for path in (folder, *folder.iterdir()))
+    except OSError:  # while we look
+        return True
+    return abs(time.time() - changed_s) < _COPYING_S
 
 
 def _stamps(folder: Path) -> tuple[Any, ...]:

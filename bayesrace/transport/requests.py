@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any, Final, Generic, TypeVar
 
@@ -242,12 +243,12 @@ class Request:
 
     def _end(self, reply: Callable[[Any], None]) -> None:
         queries, self._queries = self._queries, []
-        for query in queries:
-            try:
-                reply(query)
-            except zenoh.ZError:
-                pass
-            finally:
+        try:
+            for query in queries:
+                with suppress(zenoh.ZError):
+                    reply(query)
+        finally:
+            for query in queries:  # whatever has failed: its client would wait for the end
                 query.drop()
 
 

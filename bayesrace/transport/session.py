@@ -25,7 +25,7 @@ from typing import Any, Final
 import zenoh
 
 from bayesrace.defaults import MAX_WEIGHTS_BYTES
-from bayesrace.errors import InputError, RestartError, TransientError
+from bayesrace.errors import PASSING, InputError, RestartError, TransientError
 from bayesrace.messages import (
     ALIVE,
     ALIVE_SOURCES,
@@ -84,9 +84,7 @@ _SERVERS: Final[tuple[Role, ...]] = ("plant", "controller", "router")
 """Processes that wait as long as they run, for an endpoint to listen on, too."""
 _LISTEN_S: Final = 0.5
 """Time between two attempts to listen."""
-_PASSING: Final = (
-    errno.EADDRINUSE, errno.EADDRNOTAVAIL, errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM,
-)  # fmt: skip
+_PASSING: Final = (errno.EADDRINUSE, errno.EADDRNOTAVAIL, *PASSING)
 """Why an endpoint cannot be listened on now, and may be later: another process has it or has just
 ended, the network of this machine is not up yet, the system is short of something."""
 

@@ -7,7 +7,9 @@ import atexit
 import gc
 import io
 import logging
+import os
 import shutil
+import signal
 import sys
 from importlib import import_module
 from tempfile import gettempdir
@@ -17,7 +19,7 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 from typer.main import get_command
 
-from bayesrace.errors import InputError, RestartError, faults_in
+from bayesrace.errors import PASSING, InputError, RestartError, faults_in
 from bayesrace.operation.cli.declaration import Group, configured
 from bayesrace.processes import remembering_interrupts
 
@@ -141,6 +143,8 @@ def _options(
 
 def main() -> None:
     """Runs the command line; bad input and lost processes end in one line, not in a traceback."""
+    if os.getpid() == 1:  # as in a container: the system has no default action for it
+        signal.signal(signal.SIGTERM, lambda number, _frame: sys.exit(128 + number))
     # At the very end the interpreter looks for cyclic garbage once more, 0.05 s and longer.
     atexit.register(gc.freeze)
     for stream in (sys.stdout, sys.stderr):
@@ -160,7 +164,10 @@ def main() -> None:
         if text is None:
             raise
         ours = isinstance(error, RuntimeError) and not isinstance(error, RecursionError)
-        _fail(text, _RESTART if isinstance(error, RestartError) else 1 if ours else 2)
+        system = error.__cause__ if isinstance(error, InputError) else error
+        passes = isinstance(system, OSError) and system.errno in PASSING
+        restart = passes or isinstance(error, RestartError)
+        _fail(text, _RESTART if restart else 1 if ours else 2)
 
 
 def _in_words(error: Exception) -> str | None:

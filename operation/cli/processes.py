@@ -25,8 +25,6 @@ __all__ = ["controller", "doctor", "go", "plant", "router", "status", "stop"]
 
 _log = logging.getLogger("bayesrace.links")
 
-_COPYING: Final = 10
-"""So many seconds may pass while the files of a renewed certificate are copied one by one."""
 _NAME: Final = options.value("Name of the car.", "")
 _REASON: Final = options.value(
     "Reason, which the controller's status then shows.", "", metavar="TEXT"
@@ -140,19 +138,15 @@ def router(
 def _once_valid(network: "Configuration", role: "Role", **where: Any) -> "Endpoints":
     """The endpoints of a process, once its certificate is valid.
 
-    The log says once that it has expired or is not valid yet: somebody may renew it, and the clock
-    of a board may be set after its start.
+    The log says once what is wrong with it: somebody may renew or copy it, and the clock of a board
+    may be set after its start.
     """
-    said, faults = "", 0
+    said = ""
     while True:
         try:
             return network.endpoints(role, **where)
         except TransientError as error:
-            text, faults = str(error), 0
-        except InputError:
-            text, faults = said, faults + 1
-            if not said or faults > _COPYING:
-                raise
+            text = str(error)
         if (fault := text.partition(": ")[0]) != said:  # what follows has the time in it
             _log.warning("%s; this waits until then", text)
         said = fault
