@@ -17,10 +17,12 @@ from pathlib import Path
 from typing import Final, TypeVar
 
 from bayesrace.errors import InputError
-from bayesrace.files import replacing
+from bayesrace.files import replacing, temporary_folder
+from bayesrace.trusted_files import make_folder, trusted
 
 __all__ = [
     "cache_folder",
+    "code_folder",
     "cpu_digest",
     "cpu_identity",
     "digest",
@@ -67,6 +69,14 @@ def cache_folder() -> Path:
     except RuntimeError:  # no HOME, and a user whom the system does not know
         raise InputError("there is no home folder for the cache; set BAYESRACE_CACHE") from None
     return Path(base) / "bayesrace"
+
+
+def code_folder() -> Path:
+    """The :func:`cache_folder`, made if need be, for results that are executed.
+
+    InputError if it cannot be made, or other users could exchange what is there.
+    """
+    return trusted(cache_folder(), make=True)
 
 
 def digest(parts: Iterable[str | bytes]) -> str:
@@ -116,7 +126,7 @@ def locked(path: Path) -> Iterator[None]:
     """
     locks = path.parent / ".locks"
     try:
-        locks.mkdir(parents=True, exist_ok=True)
+        make_folder(locks)
         file = (locks / path.name).open("w")
     except OSError as error:
         raise InputError(
@@ -145,7 +155,11 @@ def kept(path: Path, make: Callable[[Path], None], read: Callable[[Path], Result
     with locked(path):
         with suppress(InputError):  # made by another process, meanwhile
             return read_found()
-        with replacing(path) as partial:
-            make(partial)
+        # Nobody else can open it for writing while its mode is that of the umask.
+        with replacing(path) as partial, temporary_folder(str(path.parent)) as own:
+            made = own / partial.name
+            make(made)
+            made.chmod(made.stat().st_mode & 0o755)
+            made.replace(partial)
     note_use(made=True)
     return read(path)

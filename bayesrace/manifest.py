@@ -7,16 +7,18 @@ or scheme are refused by comparing :attr:`Manifest.discretisation`.
 import hashlib
 import os
 import re
-import stat
 import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
-from typing import Final
+from typing import BinaryIO, Final
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from bayesrace.errors import InputError, faults_in
 from bayesrace.files import read_whole
+from bayesrace.trusted_files import trusted
 from bayesrace.vehicles.parameters import CarParameters
 
 __all__ = [
@@ -26,13 +28,10 @@ __all__ = [
     "Manifest",
     "ParameterInfo",
     "ProblemInfo",
-    "check_library",
-    "check_owner",
     "interface_version",
+    "opened_library",
     "read_manifest",
 ]
-
-_ROOT: Final = 0
 
 LIBRARY: Final = "libmpc.so"
 DECLARATIONS: Final = "libmpc_interface.py"
@@ -125,14 +124,15 @@ def interface_version() -> int:
 
 
 def read_manifest(artefact: Path) -> Manifest:
-    """Manifest of the artefact folder; InputError if it is not one or belongs to another ABI."""
+    """Manifest of the artefact folder; InputError if it is not one, belongs to another ABI, or
+    other users could have put it there."""
     path = artefact / MANIFEST
     if not os.access(path, os.F_OK):  # where that may not be looked at, it is none either
         raise InputError(
             f"{artefact} is not a built controller (no {MANIFEST}): run 'bayesrace build'"
         )
     try:
-        manifest = Manifest.model_validate_json(read_whole(path, "the manifest"))
+        manifest = Manifest.model_validate_json(read_whole(trusted(path), "the manifest"))
     except ValidationError as error:
         raise InputError(
             f"{path} is no manifest ({faults_in(error)}): run 'bayesrace build'"
@@ -145,38 +145,32 @@ def read_manifest(artefact: Path) -> Manifest:
     return manifest
 
 
-def check_library(artefact: Path, manifest: Manifest) -> Path:
-    """The library of the artefact, which is code that will be executed, as its declarations are.
+@contextmanager
+def opened_library(artefact: Path, manifest: Manifest) -> Iterator[tuple[bytes, BinaryIO]]:
+    """Declarations of the artefact, and its opened library: code that may be executed.
 
-    InputError if they are not those that the manifest describes, or others may have put them there:
-    they have to belong to this user or to root, and not to be writable for every user.
+    InputError if they are not those that the manifest describes, or other users could have put them
+    there; see :func:`bayesrace.trusted_files.trusted`.
     """
-    for path, expected in (
-        (artefact / DECLARATIONS, manifest.interface_sha256),
-        (artefact / LIBRARY, manifest.library_sha256),
+    with (
+        _opened(artefact / DECLARATIONS, manifest.interface_sha256) as declarations,
+        _opened(artefact / LIBRARY, manifest.library_sha256) as library,
     ):
-        try:
-            digest = hashlib.sha256(path.read_bytes()).hexdigest()
-            for one in (artefact, path):
-                check_owner(one)
-        except OSError as error:
-            raise InputError(
-                f"{path} cannot be read ({error.strerror or error}): run 'bayesrace build'"
-            ) from None
-        if digest != expected:
+        yield declarations.read(), library
+
+
+@contextmanager
+def _opened(path: Path, sha256: str) -> Iterator[BinaryIO]:
+    try:
+        file = trusted(path).open("rb")
+    except OSError as error:
+        raise InputError(
+            f"{path} cannot be read ({error.strerror or error}): run 'bayesrace build'"
+        ) from None
+    with file:
+        if hashlib.file_digest(file, "sha256").hexdigest() != sha256:
             raise InputError(
                 f"{path} is not the file its manifest describes: run 'bayesrace build'"
             )
-    return artefact / LIBRARY
-
-
-def check_owner(path: Path) -> None:
-    """InputError for a file of another user but root, or one that every user may write."""
-    status = path.stat()
-    if status.st_uid not in (os.geteuid(), _ROOT):
-        raise InputError(
-            f"{path} belongs to another user (number {status.st_uid}), whose code is not executed: "
-            "build your own, or set BAYESRACE_CACHE to a folder of yours"
-        )
-    if status.st_mode & stat.S_IWOTH:
-        raise InputError(f"{path} is writable for every user: remove it, or 'chmod o-w' it")
+        file.seek(0)
+        yield file

@@ -17,7 +17,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from bayesrace.cache import cache_folder, digest, kept, locked, note_use, software
+from bayesrace.cache import code_folder, digest, kept, locked, note_use, software
 from bayesrace.codegen.compiler import FLAGS, Compiler, find_compiler
 from bayesrace.codegen.settings import BuildSettings
 from bayesrace.errors import InputError
@@ -28,11 +28,11 @@ from bayesrace.manifest import (
     Manifest,
     ParameterInfo,
     ProblemInfo,
-    check_library,
-    check_owner,
     interface_version,
+    opened_library,
     read_manifest,
 )
+from bayesrace.trusted_files import trusted
 from bayesrace.vehicles import get_car
 
 if TYPE_CHECKING:
@@ -192,16 +192,14 @@ def _library(compiler: Compiler, folder: Path, daqp: Path) -> bytes:
         compiler.shared_library(sorted(folder.glob("*.c")), [folder], [daqp], path)
         data = path.read_bytes()
         path.write_bytes(hashlib.sha256(data).digest() + data)
-        path.chmod(_MODE)
 
-    return kept(cache_folder() / f"library-{identity}", make, _read_library)
+    return kept(code_folder() / f"library-{identity}", make, _read_library)
 
 
 def _read_library(path: Path) -> bytes:
     """A library behind its SHA-256; InputError if it is absent, damaged or another user's."""
     try:
-        check_owner(path)
-        data = path.read_bytes()
+        data = trusted(path).read_bytes()
     except OSError as error:
         raise InputError(f"{path}: {error.strerror or error}") from None
     seal, library = data[:32], data[32:]
@@ -221,16 +219,18 @@ def build(
     settings without.
     Raises CompileError with the compiler's own words, InputError if there is no compiler.
     """
+    cache = code_folder()
     compiler = find_compiler()
     identity = build_hash(settings, compiler, problem)
     name = problem.name if problem else f"{settings.problem}-{settings.model}"
-    target = cache_folder() / f"{name}-{identity}"
+    target = cache / f"{name}-{identity}"
 
     def built() -> tuple[Path, Manifest] | None:
         """What the cache has; None if it is absent, damaged, or another user's."""
         try:
             manifest = read_manifest(target)
-            check_library(target, manifest)
+            with opened_library(target, manifest):
+                pass
         except InputError:
             return None
         progress(f"{name}: cached")
@@ -251,7 +251,7 @@ def build(
             _compile(problem, settings, compiler, folder)
             manifest = _manifest(problem, settings, compiler, identity, folder)
             (folder / MANIFEST).write_text(manifest.model_dump_json(indent=1) + "\n")
-            for one in (folder, folder / LIBRARY, folder / DECLARATIONS):
+            for one in (folder, *(folder / name for name in (LIBRARY, DECLARATIONS, MANIFEST))):
                 one.chmod(_MODE)
             folder.rename(target)
     note_use(made=True)

@@ -17,11 +17,11 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from bayesrace.cache import cache_folder, cpu_identity, digest, kept, software
+from bayesrace.cache import cache_folder, code_folder, cpu_identity, digest, kept, software
 from bayesrace.errors import InputError
 from bayesrace.files import temporary_folder
-from bayesrace.manifest import check_owner
 from bayesrace.processes import RUN_MODULE
+from bayesrace.trusted_files import make_folder, trusted
 
 if TYPE_CHECKING:
     import casadi as ca
@@ -134,8 +134,8 @@ def _can_build(compiler: Compiler) -> None:
         probe = Path(folder) / "probe.c"
         probe.write_text("#include <math.h>\nint probe(void) { return 0; }\n")
         _run([*compiler.command, "-shared", "-fPIC", str(probe), "-lm", "-o", f"{probe}.so"])
-    with suppress(OSError):  # the cache says so where it is used
-        proof.parent.mkdir(parents=True, exist_ok=True)
+    with suppress(OSError, InputError):  # the cache says so where it is used
+        make_folder(proof.parent)
         proof.touch()
 
 
@@ -178,7 +178,7 @@ def compiled(function: "ca.Function") -> "ca.Function":
     import casadi as ca
 
     parts = (function.serialize(), *_EXACT, cpu_identity(), *software((), ("casadi",)))
-    path = cache_folder() / f"{function.name()}-{digest(parts)}.so"
+    name = f"{function.name()}-{digest(parts)}.so"
 
     def make(partial: Path) -> None:
         compiler = find_compiler()
@@ -191,13 +191,12 @@ def compiled(function: "ca.Function") -> "ca.Function":
 
     def read(library: Path) -> "ca.Function":
         try:
-            check_owner(library)
-            return ca.external(function.name(), str(library))
+            return ca.external(function.name(), str(trusted(library)))
         except (OSError, RuntimeError) as error:
             raise InputError(f"{library} cannot be loaded ({error}): remove it") from None
 
     try:
-        return kept(path, make, read)
+        return kept(code_folder() / name, make, read)
     except InputError as error:
         _log.warning("CasADi interprets '%s', which takes longer: %s", function.name(), error)
         return function

@@ -19,7 +19,8 @@ from bayesrace.controller.interface import Environment
 from bayesrace.controller.settings import MpcSettings
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import OUTPUT_HEAD, GpWeights, pack_weights
-from bayesrace.manifest import DECLARATIONS, check_library, read_manifest
+from bayesrace.manifest import DECLARATIONS, LIBRARY, opened_library, read_manifest
+from bayesrace.trusted_files import loadable
 from bayesrace.vehicles import CarParameters
 
 if TYPE_CHECKING:
@@ -62,18 +63,19 @@ class Artefact:
     def __init__(self, folder: Path) -> None:
         """InputError if it cannot be used here."""
         self.manifest = read_manifest(folder)
-        self.path = check_library(folder, self.manifest)
+        with opened_library(folder, self.manifest) as (declarations, library):
+            self.path = loadable(library, self.manifest.library_sha256)
         declared: dict[str, Any] = {}
-        text = (folder / DECLARATIONS).read_bytes()  # has been checked as the library has
-        exec(compile(text, DECLARATIONS, "exec"), declared)  # noqa: S102
+        exec(compile(declarations, DECLARATIONS, "exec"), declared)  # noqa: S102
         self.ffi: Any = declared["ffi"]
         try:
             self.library: Any = self.ffi.dlopen(str(self.path))
         except OSError as error:
             raise InputError(
-                f"{self.path} cannot be loaded here ({error}): it was built for another machine, "
-                "or its file system allows no programs (noexec); remove the folder and run "
-                "'bayesrace build', with BAYESRACE_CACHE set to another folder if need be"
+                f"{folder / LIBRARY} cannot be loaded here ({error}): it was built for another "
+                "machine, its file system allows no programs (noexec), or /proc is missing; remove "
+                "the folder and run 'bayesrace build', with BAYESRACE_CACHE set to another folder "
+                "if need be"
             ) from None
 
     def memory(self, size: int) -> Any:

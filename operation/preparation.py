@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final, Literal
 
-from bayesrace.cache import cache_folder, cpu_identity, digest, kept, software
+from bayesrace.cache import cache_folder, code_folder, cpu_identity, digest, kept, software
 from bayesrace.codegen.build import build
 from bayesrace.codegen.compiler import compiled, find_compiler
 from bayesrace.codegen.settings import BuildSettings
@@ -135,8 +135,9 @@ def prepare(
     Raises InputError for a track, car or line that cannot be used, RaceLineError, CompileError, and
     FmuFault if the FMU fails in the training drive.
     """
-    if artefact is None:
-        find_compiler()  # what is missing is reported now, not after the training
+    if artefact is None:  # what is missing is reported now, not after the training
+        code_folder()
+        find_compiler()
     car = settings.driven_car
     driven_on = [load_track(name, car.width_m) for name in tracks]
     prepared_tracks = []

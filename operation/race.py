@@ -13,7 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
-from bayesrace.cache import note_use
+from bayesrace.cache import code_folder, note_use
 from bayesrace.codegen.compiler import find_compiler
 from bayesrace.columns import LogColumns
 from bayesrace.errors import InputError
@@ -94,6 +94,7 @@ def race(settings: RaceSettings, out: Path, stages: Stages) -> Recording:
             f"true_grip {settings.true_grip:g} is for campaigns: here the car is that of its file; "
             "give a car with other tyres"
         )
+    code_folder()
     find_compiler()  # what is missing is reported now, before there is a run directory
     for name in (settings.train_track, settings.track):
         load_track(name, settings.driven_car.width_m)

@@ -7,6 +7,7 @@ import os
 import re
 import shutil
 import subprocess
+import tempfile
 from collections.abc import Callable, Generator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,12 +17,14 @@ import pytest
 from numpy.typing import ArrayLike
 
 from bayesrace.arrays import Floats
+from bayesrace.cache import code_folder
 from bayesrace.codegen.build import build
 from bayesrace.codegen.problems.tracking import tracking
 from bayesrace.codegen.settings import BuildSettings
 from bayesrace.controller.assembly import PathTable, make_path_table
 from bayesrace.controller.native_step import NativeStep
 from bayesrace.controller.settings import MpcSettings
+from bayesrace.errors import InputError
 from bayesrace.gp.expression import kernel_matrix
 from bayesrace.gp.weights import KERNELS, GpOutput, GpWeights
 from bayesrace.integrators import PREDICTION, Discretisation
@@ -36,6 +39,11 @@ from tests.zig import ziglang
 
 __all__ = ["cli", "ziglang"]  # fixtures for all tests
 
+
+try:
+    code_folder()
+except InputError:  # as for root with the home of another user, which some CI containers have
+    os.environ["BAYESRACE_CACHE"] = f"{tempfile.gettempdir()}/bayesrace-tests-{os.geteuid()}"
 
 # the components that change sign in a mirror at the x axis
 MIRROR_STATE = np.array([1.0, -1.0, -1.0, 1.0, -1.0, -1.0, -1.0])

@@ -144,5 +144,5 @@ def test_weights_are_kept_for_their_samples_settings_and_beginning(
 
 def test_a_cache_that_cannot_be_written_is_named_with_the_remedy(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    with pytest.raises(InputError, match=r"cache .*file: .*set BAYESRACE_CACHE"):
+    with pytest.raises(InputError, match=r"file.* cannot be made .*BAYESRACE_CACHE"):
         kept(tmp_path / "file" / "result", lambda _: None, read)

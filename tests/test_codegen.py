@@ -1,12 +1,15 @@
 """Code generation: the cache's hash sees everything, what cannot be built or loaded is reported."""
 
+import hashlib
 import os
 import shutil
 import subprocess
+import tempfile
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, BinaryIO, cast
 
 import casadi as ca
 import numpy as np
@@ -33,8 +36,16 @@ from bayesrace.controller.native_step import Artefact, NativeStep, StepStatus
 from bayesrace.controller.settings import SAMPLES, WATCHED, MpcSettings
 from bayesrace.errors import InputError
 from bayesrace.integrators import PERFECT, PREDICTION, Discretisation
-from bayesrace.manifest import LIBRARY, MANIFEST, read_manifest
+from bayesrace.manifest import (
+    DECLARATIONS,
+    LIBRARY,
+    MANIFEST,
+    Manifest,
+    opened_library,
+    read_manifest,
+)
 from bayesrace.messages.types import BRAKING_ROWS, SENSOR_FAULTS
+from bayesrace.operation.cli import export
 from bayesrace.processes import RUN_MODULE
 from bayesrace.vehicles import CarParameters, get_car
 from bayesrace.vehicles.models import MODELS
@@ -286,6 +297,13 @@ def test_a_damaged_library_is_refused(artefact: Path, car: CarParameters) -> Non
         load(artefact, car)
 
 
+def test_changed_declarations_are_refused(artefact: Path, car: CarParameters) -> None:
+    with (artefact / DECLARATIONS).open("a") as file:
+        file.write("raise RuntimeError('executed')\n")
+    with pytest.raises(InputError, match=rf"{DECLARATIONS} is not the file its manifest describes"):
+        load(artefact, car)
+
+
 def _cut(library: Path) -> None:
     data = library.read_bytes()
     library.unlink()
@@ -309,26 +327,100 @@ def test_an_artefact_that_cannot_be_trusted_is_built_again(
     assert contents(cache) == [folder]
 
 
-def test_what_anybody_may_write_or_others_own_is_not_loaded(
-    artefact: Path, car: CarParameters, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("name", [LIBRARY, DECLARATIONS, MANIFEST, "."])
+def test_what_others_may_write_or_own_is_not_loaded(
+    artefact: Path, car: CarParameters, monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
-    (artefact / LIBRARY).chmod(0o777)
-    with pytest.raises(InputError, match=r"is writable for every user.*chmod"):
+    one = artefact / name
+    mode = one.stat().st_mode
+    one.chmod(mode | 0o002)
+    with pytest.raises(InputError, match=rf"{one} is writable for other users.*chmod go-w"):
         load(artefact, car)
-    (artefact / LIBRARY).chmod(0o755)
+    one.chmod(mode)
+    load(artefact, car)
     monkeypatch.setattr("os.geteuid", lambda: 12345)
-    monkeypatch.setattr("bayesrace.manifest._ROOT", 54321)
+    monkeypatch.setattr("bayesrace.trusted_files._ROOT", 54321)
     with pytest.raises(InputError, match=r"belongs to another user.*BAYESRACE_CACHE"):
         load(artefact, car)
 
 
-@pytest.mark.usefixtures("cache")
-def test_what_is_built_may_be_loaded_whatever_the_umask(car: CarParameters) -> None:
-    before = os.umask(0)
+_EVIL = """#include <stdio.h>
+__attribute__((constructor)) static void run(void) { FILE *f = fopen("%s", "w"); fclose(f); }
+"""
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root becomes another user")
+def test_code_of_a_user_in_the_group_is_not_executed(
+    artefact: Path, car: CarParameters, tmp_path: Path
+) -> None:
+    """The attacker may write library and manifest, as the umask 002 and a shared group allow."""
+    ran = tmp_path / "ran"
+    with tempfile.TemporaryDirectory() as temporary:  # where the attacker gets, unlike tmp_path
+        top = Path(temporary)
+        top.chmod(0o755)
+        (top / "evil.c").write_text(_EVIL % ran)
+        find_compiler().run("-shared", "-fPIC", top / "evil.c", "-o", top / "evil.so")
+        digest = hashlib.sha256((top / "evil.so").read_bytes()).hexdigest()
+        forged = read_manifest(artefact).model_copy(update={"library_sha256": digest})
+        (top / "forged").write_text(forged.model_dump_json())
+        shared = Path(shutil.copytree(artefact, top / "artefact"))
+        for one in (shared / LIBRARY, shared / MANIFEST):
+            os.chown(one, -1, 54321)
+            one.chmod(0o775)
+        attack = f"cat evil.so >artefact/{LIBRARY}; cat forged >artefact/{MANIFEST}"
+        subprocess.run(
+            ["sh", "-ec", attack], cwd=top, user=12345, group=54321, extra_groups=[], check=True
+        )
+        with pytest.raises(InputError, match=r"writable for other users.*chmod go-w"):
+            load(shared, car)
+    assert not ran.exists()
+
+
+def test_what_is_exchanged_after_it_was_checked_is_not_loaded(
+    artefact: Path, car: CarParameters, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    @contextmanager
+    def exchanged(folder: Path, manifest: Manifest) -> Iterator[tuple[bytes, BinaryIO]]:
+        with opened_library(folder, manifest) as opened:
+            for name in (DECLARATIONS, LIBRARY):
+                (folder / name).unlink()
+                (folder / name).write_text("raise RuntimeError('not what was checked')")
+            yield opened
+
+    monkeypatch.setattr("bayesrace.controller.native_step.opened_library", exchanged)
+    step = load(artefact, car)
+    assert step.predict(np.r_[0.0, 0, 0, 1, 0, 0, 0], np.r_[0.5, 0], 0.02)[0] > 0
+    monkeypatch.undo()
+    with pytest.raises(InputError, match="is not the file its manifest describes"):
+        load(artefact, car)
+
+
+@pytest.mark.parametrize("umask", [0, 0o002])
+def test_what_is_built_may_be_loaded_whatever_the_umask(
+    cache: Path, car: CarParameters, tmp_path: Path, umask: int
+) -> None:
+    before = os.umask(umask)
     try:
-        load(build(SMALL)[0], car)
+        export.build(cast("Any", lambda **_: SMALL), tmp_path / "new" / "copy")
     finally:
         os.umask(before)
+    (folder,) = contents(cache)
+    load(folder, car)
+    load(tmp_path / "new" / "copy", car)
+
+
+def test_nothing_is_built_where_it_would_not_be_loaded(cache: Path, tmp_path: Path) -> None:
+    (tmp_path / "open").mkdir()
+    (tmp_path / "open").chmod(0o777)
+    with pytest.raises(InputError, match=r"open is writable for other users.*chmod go-w"):
+        export.build(cast("Any", lambda **_: SMALL), tmp_path / "open" / "copy")
+    assert not cache.exists()
+    assert not [*tmp_path.rglob(LIBRARY)]
+    cache.mkdir()
+    cache.chmod(0o777)
+    with pytest.raises(InputError, match=rf"{cache} is writable for other users.*chmod go-w"):
+        build(SMALL)
+    assert contents(cache) == []
 
 
 def test_the_names_and_numbers_in_python_are_those_of_the_header(kinematic_artefact: Path) -> None:

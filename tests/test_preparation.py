@@ -87,6 +87,15 @@ def test_a_second_preparation_computes_nothing_and_says_so(
     assert len(again.training.samples) > 80
 
 
+def test_a_cache_that_others_may_write_is_refused_before_all_else(
+    preparing: Preparing, tmp_path: Path
+) -> None:
+    (tmp_path / "cache").chmod(0o777)
+    with pytest.raises(InputError, match=r"cache is writable for other users.*chmod go-w"):
+        preparing()
+    assert len([*(tmp_path / "cache").iterdir()]) == 1  # the controller that was there
+
+
 def test_the_training_drive_is_kept_for_all_that_shapes_it(preparing: Preparing) -> None:
     logs = set()
     for changes in (

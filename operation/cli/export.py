@@ -10,6 +10,7 @@ from bayesrace.errors import InputError
 from bayesrace.files import write_whole
 from bayesrace.operation.cli import options
 from bayesrace.operation.cli.declaration import Given, Group, options_of
+from bayesrace.trusted_files import trusted
 
 if TYPE_CHECKING:
     from bayesrace.codegen.settings import BuildSettings
@@ -30,6 +31,8 @@ def build(
     chosen = settings()
     if chosen.model == "dynamic":
         chosen = settings(discretisation=PERFECT)
+    if out is not None:
+        trusted(out, make=True)  # now, as its loader would refuse it after the work
     folder, _ = make(chosen)
     if out is not None:
         shutil.copytree(folder, out, dirs_exist_ok=True, copy_function=_replace)
@@ -40,6 +43,7 @@ def build(
 def _replace(source: str, target: str) -> None:
     """Copies beside the target and renames: a running controller keeps the library it loaded."""
     beside = f"{target}.new"
+    Path(beside).touch(0o600)  # nobody else can open it for writing before it has its mode
     shutil.copy2(source, beside)
     Path(beside).replace(target)
 
