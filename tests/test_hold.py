@@ -157,7 +157,10 @@ class Controller:
 
     def command(self, word: str) -> None:
         request = SimpleNamespace(
-            service=COMMAND, payload=encode(blank(Command, command=word)), reply=lambda *_: None
+            service=COMMAND,
+            payload=encode(blank(Command, command=word)),
+            by={},
+            reply=lambda *_: None,
         )
         self.service.react(Item(Kind.REQUEST, COMMAND.name, request, 0))
 
