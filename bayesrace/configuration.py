@@ -10,7 +10,7 @@ import json
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
@@ -64,6 +64,11 @@ class NetworkSettings(_Section):
     router: tuple[Endpoint, ...] = Field(
         (), description="where the router listens, and all others find it"
     )
+    hosts: tuple[Annotated[str, Field(pattern=r"^[\w.:/-]+$")], ...] = Field(
+        (),
+        description="other hosts that may connect, those of directors, say: names, addresses, "
+        "networks; for 'bayesrace config firewall'",
+    )
     insecure: bool = Field(
         False, description="without certificates: allow endpoints beyond loopback; warns each time"
     )
@@ -86,6 +91,11 @@ class NetworkSettings(_Section):
     def by_router(self) -> bool:
         """Whether all connect to a router alone."""
         return bool(self.router) and self.mode != "direct"
+
+    def listens(self, role: Role) -> tuple[str, ...]:
+        """Where a process in that role listens; by a router, only it does."""
+        own = {"plant": self.plant, "controller": self.controller, "router": self.router}
+        return own.get(role, ()) if role == "router" or not self.by_router else ()
 
     @property
     def everyone(self) -> tuple[str, ...]:
@@ -150,16 +160,11 @@ class Configuration(_Section):
     ) -> Endpoints:
         """Where a process in that role listens and connects; what is given overrides the file."""
         network = self.network
-        where: dict[Role, tuple[tuple[str, ...], tuple[str, ...]]] = {
-            "plant": (network.plant, ()), "controller": (network.controller, network.plant),
-            "router": (network.router, ()),
-        }  # fmt: skip
-        listens, connects = where.get(role, ((), network.everyone))
-        if network.by_router and role != "router":
-            listens, connects = (), network.router
+        own: dict[Role, tuple[str, ...]] = {"plant": (), "controller": network.plant}
+        connects = network.everyone if network.by_router else own.get(role, network.everyone)
         return Endpoints(
-            listen=tuple(listen or listens),
-            connect=tuple(connect or connects),
+            listen=tuple(listen or network.listens(role)),
+            connect=tuple(connect or (() if role == "router" else connects)),
             low_latency=low_latency,
             mode="router" if role == "router" else "peer",
             credentials=self.tls.credentials(role),

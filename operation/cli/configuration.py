@@ -4,7 +4,7 @@ import os
 import sys
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, get_args
+from typing import TYPE_CHECKING, Final, Literal, get_args
 
 import typer
 
@@ -72,6 +72,26 @@ def example(
         raise InputError(f"{out} exists: name another file, or remove it")
     else:
         write_whole(out, text)
+
+
+def firewall(
+    configuration: "Configuration",
+    role: Literal["plant", "controller", "router"] = options.argument(
+        "ROLE", "plant, controller or router."
+    ),
+    listen: list[str] = options.value(
+        "Endpoint where it listens; repeatable.", (), metavar="ENDPOINT", shown="as configured"
+    ),
+    out: Path | None = options.new_file("File to write.", "--out", "-o"),
+) -> None:
+    """Make the rules of nftables for a process: who may connect to it, and how often.
+
+    Those are the hosts that [network] names; 'nft -f' loads the rules (docs/security.md).
+    """
+    from bayesrace.operation.firewall import rules
+
+    text = rules(configuration.network, role, listen)
+    typer.echo(text, nl=False) if out is None else write_whole(out, text)
 
 
 def _folder(given: Path | None, configuration: "Configuration") -> Path:
@@ -164,7 +184,7 @@ def revoke(
 
 config = Group(
     "The configuration, bayesrace.toml: where processes are, how they are secured.",
-    {"show": show, "check": check, "example": example},
+    {"show": show, "check": check, "example": example, "firewall": firewall},
 )
 certs = Group(
     "Certificates: who may drive, learn, command or look on.",

@@ -45,7 +45,7 @@ def config(*files: str, base: str = BASE) -> subprocess.CompletedProcess[str]:
         pytest.skip("needs podman, see .ci/tools")
     command = Path(sys.executable).with_name("podman-compose")
     given = [word for file in files for word in ("-f", str(DOCKER / file))]
-    environment = {**os.environ, "BAYESRACE_BASE": base}
+    environment = {**os.environ, "BAYESRACE_BASE": base, "BAYESRACE_HAPROXY": BASE}
     return subprocess.run(
         [command, *given, "config"], env=environment, capture_output=True, text=True
     )
@@ -61,7 +61,8 @@ def services(*files: str) -> dict[str, Any]:
 @pytest.mark.parametrize("files", [("compose.yaml",), ("compose.yaml", "compose.tls.yaml")])
 def test_every_service_is_hardened(files: tuple[str, ...]) -> None:
     found = services(*files)
-    assert set(found) == {"prepare", "plant", "controller", "race"}
+    proxy = {"proxy"} if len(files) > 1 else set()
+    assert set(found) == {"prepare", "plant", "controller", "race"} | proxy
     for name, service in found.items():
         assert service["read_only"], name
         assert service["cap_drop"] == ["ALL"]
@@ -88,6 +89,19 @@ def test_certificates_take_the_place_of_plain_links_everywhere() -> None:
         held = {one.split(":")[1] for one in volumes if "/certs/" in one}
         assert held == {f"/certs/{role}"}
         assert "tcp/" not in str(found[name])
+
+
+def test_who_is_outside_reaches_plant_and_controller_through_the_proxy_alone() -> None:
+    """By their names, and where the proxy's configuration looks for them."""
+    found = services("compose.yaml", "compose.tls.yaml")
+    assert found["proxy"]["networks"]["outside"]["aliases"] == ["plant", "controller"]
+    assert not any("/certs/" in one for one in found["proxy"]["volumes"])
+    proxied = (DOCKER / "haproxy.cfg").read_text()
+    for name in ("plant", "controller"):
+        networks = found[name]["networks"]
+        assert list(networks) == ["inside"]
+        assert f"{networks['inside']['aliases'][0]}:744" in proxied
+    assert list(found["race"]["networks"]) == ["outside"]
 
 
 def test_the_base_image_has_to_be_named() -> None:
@@ -129,14 +143,18 @@ def test_a_process_that_hangs_is_unhealthy(tmp_path: Path, monkeypatch: pytest.M
 
 
 @systemd
-def test_the_unit_is_valid_and_hardened(tmp_path: Path) -> None:
-    unit, text = tmp_path / "bayesrace@plant.service", UNIT.read_text()
-    unit.write_text(text.replace("/opt/bayesrace/bin/bayesrace", "/bin/true"))
+@pytest.mark.parametrize("name", ["bayesrace@", "bayesrace-firewall@"])
+def test_the_units_are_valid_and_hardened(tmp_path: Path, name: str) -> None:
+    unit, text = tmp_path / f"{name}plant.service", (UNIT.parent / f"{name}.service").read_text()
+    for program in ("/opt/bayesrace/bin/bayesrace", "/usr/sbin/nft"):
+        text = text.replace(program, "/bin/true")
+    unit.write_text(text)
     verified = subprocess.run(["systemd-analyze", "verify", unit], capture_output=True, text=True)
     assert (verified.returncode, verified.stderr) == (0, "")
     judged = ["systemd-analyze", "security", "--offline=yes", f"--threshold={WORST}", str(unit)]
     assert subprocess.run(judged, capture_output=True).returncode == 0
-    assert int(text.partition("LimitNOFILE=")[2].split()[0]) > LINKS
+    if name == "bayesrace@":
+        assert int(text.partition("LimitNOFILE=")[2].split()[0]) > LINKS
 
 
 def test_the_unit_installs_a_file_and_nothing_by_its_name() -> None:

@@ -1,6 +1,8 @@
 """A plant and a controller of real processes over secured links, directed and recorded."""
 
-from collections.abc import Iterator
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,10 +16,10 @@ from bayesrace.recorder import Recorder
 from bayesrace.transport import Director, free_endpoint, open_session
 from tests.network.cars import Course, Program, gentle_course
 from tests.network.observer import Journey
-from tests.programs import PATIENCE_S
+from tests.programs import PATIENCE_S, ROOT
 from tests.security.authority import CAR, Bundles, written
 
-__all__ = ["Rig", "course", "secured"]
+__all__ = ["Rig", "attacking", "course", "secured"]
 
 
 @pytest.fixture(scope="module")
@@ -93,3 +95,24 @@ def secured(
             config, bundles, router_at if router else plant_at, director, course, log, closing,
             plant, controller, between,
         )  # fmt: skip
+
+
+@contextmanager
+def attacking(
+    module: str, begins: str, *words: str | Path | int, prefix: Sequence[str] = ()
+) -> Iterator[list[str]]:
+    """For the block, that program runs; it prints ``begins``, and at its end what is then given.
+
+    ``prefix``: a command that runs it, such as ``ip netns exec``.
+    """
+    attacker = subprocess.Popen(
+        [*prefix, sys.executable, "-m", f"tests.security.{module}", *map(str, words)],
+        cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    assert attacker.stdout is not None
+    assert attacker.stdout.readline() == f"{begins}\n"
+    said: list[str] = []
+    try:
+        yield said
+    finally:
+        said += attacker.communicate("", timeout=PATIENCE_S)[0].split()

@@ -3,8 +3,6 @@
 The forgers know everything but have the wrong certificate; who replays has the right one.
 """
 
-import subprocess
-import sys
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
@@ -32,10 +30,10 @@ from bayesrace.transport import Endpoints, ask, free_endpoint, open_session
 from tests.driven import blank
 from tests.network.cars import Course, Program
 from tests.network.observer import STANDING_MPS
-from tests.programs import PATIENCE_S, ROOT, run, until
+from tests.programs import PATIENCE_S, run, until
 from tests.security.authority import CAR, Bundles, bundles, written
 from tests.security.intruder import bare_session
-from tests.security.rig import Rig, course, secured
+from tests.security.rig import Rig, attacking, course, secured
 
 __all__ = ["bundles", "course"]
 
@@ -84,22 +82,6 @@ def test_a_secured_system_is_driven_taught_and_commanded(
 
 
 # Forged ------------------------------------------------------------------------------------------
-
-
-@contextmanager
-def attacking(module: str, begins: str, *words: str | Path | int) -> Iterator[list[str]]:
-    """For the block, that program runs; it prints ``begins``, and at its end what is then given."""
-    attacker = subprocess.Popen(
-        [sys.executable, "-m", f"tests.security.{module}", *map(str, words)],
-        cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
-    )  # fmt: skip
-    assert attacker.stdout is not None
-    assert attacker.stdout.readline() == f"{begins}\n"
-    said: list[str] = []
-    try:
-        yield said
-    finally:
-        said += attacker.communicate("", timeout=PATIENCE_S)[0].split()
 
 
 @contextmanager
