@@ -149,8 +149,9 @@ def _with_copies(settings: RaceSettings, out: Path) -> RaceSettings:
 def _prepared(settings: RaceSettings, out: Path, stages: Stages) -> Prepared:
     """What the race needs, made or taken from the cache, with the limits beside it; copies in the
     run directory."""
-    # Nothing predicts with what is inside another simulator.
-    models = _MODELS if settings.simulator == "equations" else _MODELS[:1]
+    # Nothing predicts with what is inside another simulator, or with tyres that are not known.
+    known = settings.simulator == "equations" and settings.car.identified
+    models = _MODELS if known else _MODELS[:1]
     with _limits_beside(settings, out) as wait:
         with _faults_named():
             prepared = prepare(settings, (settings.track,), stages, models, settings.line)

@@ -94,7 +94,7 @@ class PreparationSettings(CarSimulation):
         car = self.driven_car
         if self.true_grip == 1:
             return car
-        return car.model_copy(update={"tyres": car.tyres.with_grip(self.true_grip)})
+        return car.model_copy(update={"tyres": car.true_tyres.with_grip(self.true_grip)})
 
     @model_validator(mode="after")
     def _simulated(self) -> Self:
@@ -149,7 +149,7 @@ class RaceSettings(PreparationSettings):
     @property
     def compares_limit(self) -> bool:
         """Whether there is a limit to compare laps with, and it is wanted."""
-        return self.limit and self.built_in and self.car.tyres.model != "linear"
+        return self.limit and self.built_in and self.car.has_limit
 
     @property
     def progress_runs(self) -> int:
@@ -174,7 +174,7 @@ class RaceSettings(PreparationSettings):
         object.__setattr__(self, "pursuit", seeded)
         object.__setattr__(self, "track", self.track or self.car.race_track)
         if self.progress_drives is None:
-            without = self.car.tyres.model == "linear" or self.simulator != "equations"
+            without = not self.car.has_limit or self.simulator != "equations"
             object.__setattr__(self, "progress_drives", 0 if without else 3)
         return self
 

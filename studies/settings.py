@@ -62,7 +62,7 @@ class BenchSettings(PreparationSettings):
         both: tuple[Case, ...] = ("tracking", caution), PUBLISHED
         if self.published:
             return (PUBLISHED,)
-        return both if self.car.tyres.model == "linear" else both + progress
+        return both + progress if self.car.has_limit else both
 
 
 # The paper -------------------------------------------------------------------------------------

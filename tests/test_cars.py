@@ -10,8 +10,10 @@ from bayesrace.codegen.build import problem_of
 from bayesrace.codegen.problems.generate import c_header
 from bayesrace.codegen.settings import BuildSettings
 from bayesrace.errors import InputError
+from bayesrace.integrators import PREDICTION
 from bayesrace.operation.settings import RaceSettings
-from bayesrace.raceline import RaceLine
+from bayesrace.raceline import RaceLine, compute_raceline
+from bayesrace.tracks import load_track
 from bayesrace.vehicles import (
     CarParameters,
     Tuning,
@@ -22,9 +24,10 @@ from bayesrace.vehicles import (
     read_car,
     write_car,
 )
+from bayesrace.vehicles.models import e_kinematic
 from bayesrace.vehicles.parameters import MODELS, SECTIONS
 from bayesrace.vehicles.parts import Pacejka
-from tests.command_line import Cli
+from tests.command_line import Cli, refused
 
 ORCA = Path(__file__).parents[1] / "bayesrace" / "cars" / "orca.toml"
 EXTENDING = Path(__file__).parents[1] / "docs" / "extending.md"
@@ -72,6 +75,47 @@ def test_a_car_survives_its_file_and_its_description(tmp_path: Path) -> None:
     assert car_text(default_car()) == "orca"
     with pytest.raises(InputError, match="unknown car"):  # logs of others name no files to read
         described_car(str(tmp_path / "mine.toml"))
+
+
+def unidentified(folder: Path) -> Path:
+    """The built-in car's file without what a ruler and a scale do not tell."""
+    text = re.sub(r"\[tyres\]\n(.+\n)+|inertia_kgm2.*\n", "", ORCA.read_text())
+    return written(folder, text)
+
+
+def test_a_car_that_nobody_simulates_needs_neither_tyres_nor_inertia(tmp_path: Path) -> None:
+    car, known = read_car(unidentified(tmp_path)), default_car()
+    assert not car.identified
+    assert car.has_limit
+    assert car.identity != known.identity
+    write_car(tmp_path / "again.toml", car)
+    assert read_car(tmp_path / "again.toml") == car
+    track = load_track("paddock")
+    line, same = (compute_raceline(track, one) for one in (car, known))
+    assert np.array_equal(line.vx_mps, same.vx_mps)
+    x, u = np.array([0.0, 0.0, 0.3, 1.5, 0.1, 2.0, 0.1]), np.array([0.4, 0.5])
+    predicted, expected = (
+        PREDICTION.discretise(e_kinematic(one))(x, u).full() for one in (car, known)
+    )
+    assert np.array_equal(predicted, expected)
+    assert car.brake_numbers["brake_d"] == pytest.approx(  # half of what friction gives
+        0.5 * car.friction * 9.81 * car.mass_kg / car.drive.numbers()["cm1"]
+    )
+
+
+def test_who_simulates_a_car_names_what_its_file_lacks(tmp_path: Path, cli: Cli) -> None:
+    file = str(unidentified(tmp_path))
+    lacks = "the car 'orca' has no tyres in its file"
+    for command in (
+        ("limit", "harbour"),
+        ("plant", "--endpoint", "tcp/127.0.0.1:0"),
+        ("race", "--out", str(tmp_path / "run")),
+        ("fmu", "export", "--out", str(tmp_path / "car.fmu")),
+        ("cars", "--tyres", "pacejka"),
+    ):
+        given = (*command, file) if command[0] == "cars" else (*command, "--car", file)
+        refused(cli(*given), lacks)
+    assert list((tmp_path / "run").glob("*.*")) == []
 
 
 def test_every_value_of_a_car_has_its_place_in_the_file_and_a_unit() -> None:

@@ -180,7 +180,9 @@ def test_the_cycle_shows_states_in_a_row_of_a_car_that_moves(
 def test_a_car_that_has_lost_grip_since_it_was_learned_stays_on_the_track() -> None:
     """A fifth of the tyre forces of the car that the weights and the line are made for."""
     race = racing("random:8")
-    slippery = built_in_car(race.car.model_copy(update={"tyres": race.car.tyres.with_grip(0.8)}))
+    slippery = built_in_car(
+        race.car.model_copy(update={"tyres": race.car.true_tyres.with_grip(0.8)})
+    )
     samples = []
     for mpc in (MpcSettings(caution=0.0), MpcSettings()):
         controller = compiled_controller(

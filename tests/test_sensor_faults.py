@@ -180,7 +180,7 @@ def alarms(race: Racing, **how: Any) -> dict[str, int]:
 
 def slippery() -> Any:
     car = get_car("orca")
-    return built_in_car(car.model_copy(update={"tyres": car.tyres.with_grip(0.8)}))
+    return built_in_car(car.model_copy(update={"tyres": car.true_tyres.with_grip(0.8)}))
 
 
 DRIVES: dict[str, Callable[[Racing], dict[str, Any]]] = {

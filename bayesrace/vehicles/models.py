@@ -197,14 +197,14 @@ def _symbolic(like: CarParameters, symbols: Iterator[Any]) -> CarParameters:
             return value.model_copy(update={n: of(v) for n, v in value if n != "model"})
         return next(symbols)
 
-    values = {name: next(symbols) for name in BODY} | {"tyres": of(like.tyres)}
+    values = {name: next(symbols) for name in BODY} | {"tyres": of(like.true_tyres)}
     drive = like.drive if like.drive.guarded else of(like.drive)
     return like.model_copy(update=values | {"drive": drive})
 
 
 def _dynamic_rates(car: CarParameters, x: Any, u: Any) -> list[Any]:
     """The equations; the car's values may be numbers or symbols."""
-    tyres = car.tyres
+    tyres = car.true_tyres
     if isinstance(tyres, LinearTyres):
         return [*_pose_rates(x), *_linear_rates(car, tyres, x, u), u[1]]
     return [*_pose_rates(x), *_pacejka_rates(car, tyres, x, u), u[1]]
@@ -264,7 +264,8 @@ def _single_track_rates(
         + tyres.mu / (v * wheelbase) * front * delta
     )
     damping = (lf**2 * front + lr**2 * rear) / v
-    stiffness = tyres.mu * car.mass_kg / (car.inertia_kgm2 * wheelbase)
+    inertia: Any = car.inertia_kgm2  # known, or a symbol
+    stiffness = tyres.mu * car.mass_kg / (inertia * wheelbase)
     return [
         along * vx / v - vy * beta_rate,
         along * vy / v + vx * beta_rate,

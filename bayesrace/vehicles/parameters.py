@@ -2,7 +2,8 @@
 
 What a driver can measure (geometry, mass, motor, one friction number) and what only system
 identification gives (tyre curves, yaw inertia) live in one object but are used by different models:
-the e-kinematic model and the racing line read the former only, the dynamic model reads all.
+the e-kinematic model and the racing line read the former only, the dynamic model reads all. A car
+that nobody simulates needs no more than the former.
 
 A car is a TOML file. Its sections are those of :data:`SECTIONS`, besides ``[tyres]`` and
 ``[drive]``, whose ``model`` says which values they hold (:mod:`.parts`), and ``[tuning.*]``, which
@@ -69,6 +70,8 @@ ACTUATORS: Final = ("d_min", "d_max", "delta_max_rad", "delta_rate_max_radps")
 
 _BRAKE_FADE_MPS: Final = 0.1
 """Of the reference car."""
+_UNKNOWN_BRAKING: Final = 0.5
+"""Share of the friction that a car on unknown tyres brakes with while nobody steers it."""
 
 
 def _scales(known: Mapping[str, Any]) -> Scales:
@@ -95,8 +98,10 @@ class CarParameters(Part):
     lf_m: float = Field(gt=0, description="centre of gravity to front axle [m]")
     lr_m: float = Field(gt=0, description="centre of gravity to rear axle [m]")
     mass_kg: float = Field(gt=0, description="mass [kg]")
-    inertia_kgm2: float = Field(gt=0, description="yaw moment of inertia Iz [kg m^2]")
-    tyres: Tyres = Field(description="the tyres, by their model")
+    inertia_kgm2: float | None = Field(
+        None, gt=0, description="yaw moment of inertia Iz, for who simulates the car [kg m^2]"
+    )
+    tyres: Tyres | None = Field(None, description="the tyres, by their model; likewise")
     drive: Drive = Field(description="the drive, by its model")
     d_min: float = Field(lt=0, description="lowest drive command, which brakes [command]")
     d_max: float = Field(gt=0, description="highest drive command [command]")
@@ -144,10 +149,35 @@ class CarParameters(Part):
         return self.lf_m + self.lr_m
 
     @property
+    def identified(self) -> bool:
+        """Whether the dynamic model is known: tyres and inertia."""
+        return self.tyres is not None and self.inertia_kgm2 is not None
+
+    @property
+    def has_limit(self) -> bool:
+        """Whether its tyres slide at some force: linear ones never do."""
+        return not isinstance(self.tyres, LinearTyres)
+
+    @property
+    def true_tyres(self) -> PacejkaTyres | LinearTyres:
+        """The tyres of a car that is :attr:`identified`; InputError for another one."""
+        if self.tyres is None or self.inertia_kgm2 is None:
+            raise InputError(
+                f"the car '{self.name}' has no {'tyres' if self.tyres is None else 'inertia_kgm2'} "
+                "in its file, which the simulator, BestCase and the limit need: add them, or drive "
+                "a real car, or an FMU of it"
+            )
+        return self.tyres
+
+    @property
     def equation_numbers(self) -> dict[str, float]:
-        """What the dynamic model depends on, by flat name; ``front_b`` is ``tyres.front.b``."""
+        """What the dynamic model depends on, by flat name; ``front_b`` is ``tyres.front.b``.
+
+        InputError for a car that is not :attr:`identified`.
+        """
+        tyres = self.true_tyres.numbers()
         drive = {} if self.drive.guarded else self.drive.numbers()
-        return {name: float(getattr(self, name)) for name in BODY} | self.tyres.numbers() | drive
+        return {name: float(getattr(self, name)) for name in BODY} | tyres | drive
 
     @property
     def guard_numbers(self) -> dict[str, float]:
@@ -160,10 +190,14 @@ class CarParameters(Part):
         """How a car is braked without a controller, its steering held.
 
         Drive command: -(brake_d + brake_slow / vx^2), but not below d_min, and fading to none below
-        brake_fade_mps. The tyres give the first two: a car that brakes harder may spin.
+        brake_fade_mps. The tyres give the first two: a car that brakes harder may spin. Where they
+        are not known, half of the friction is left for the bend.
         """
         command = self.drive.command_for(1.0, self.mass_kg)
-        steady, slow = self.tyres.steady_braking(self.lf_m, self.lr_m, -self.d_min / command)
+        steady, slow = _UNKNOWN_BRAKING * self.friction * GRAVITY_MPS2, 0.0
+        if self.tyres is not None:
+            hardest_mps2 = -self.d_min / command
+            steady, slow = self.tyres.steady_braking(self.lf_m, self.lr_m, hardest_mps2)
         return {
             "brake_fade_mps": self.brake_fade_mps,
             "brake_d": steady * command,
@@ -175,21 +209,22 @@ class CarParameters(Part):
 
         InputError for linear tyres in place of others.
         """
-        if self.tyres.model == model:
+        tyres = self.true_tyres
+        if tyres.model == model:
             return self
-        if not isinstance(self.tyres, LinearTyres):
+        if not isinstance(tyres, LinearTyres):
             raise InputError(
-                f"the car '{self.name}' has {self.tyres.model} tyres: write a car's file with the "
+                f"the car '{self.name}' has {tyres.model} tyres: write a car's file with the "
                 f"numbers of {model} ones"
             )
-        tyres = self.tyres.saturating(self.lf_m, self.lr_m, self.mass_kg)
-        return self.model_copy(update={"tyres": tyres})
+        saturating = tyres.saturating(self.lf_m, self.lr_m, self.mass_kg)
+        return self.model_copy(update={"tyres": saturating})
 
     def digest(self) -> str:
         """Short identity of the values that shape the models (not name, outline, grip, tuning)."""
         shape: dict[str, Any] = {name: getattr(self, name) for name in BODY}
         for part in (self.tyres, self.drive):
-            shape |= part.model_dump(exclude={"model"})
+            shape |= {} if part is None else part.model_dump(exclude={"model"})
         shape |= {name: getattr(self, name) for name in ACTUATORS}
         return hashlib.sha256(to_json(shape)).hexdigest()[:12]
 
@@ -214,7 +249,8 @@ MODELS: Final[dict[str, dict[str, type[Part]]]] = {
     "tyres": {"pacejka": PacejkaTyres, "linear": LinearTyres},
     "drive": {"dc_motor": DcMotor, "acceleration": AccelerationDrive},
 }
-"""Section with a ``model``, a field of CarParameters as a whole, to what each model holds."""
+"""Section with a ``model``, a field of CarParameters as a whole, to what each model holds; a car on
+unknown tyres lacks theirs."""
 
 _ORDER: Final = ("geometry", "tyres", "drive", "limits", "tracks", "learning")
 
@@ -330,6 +366,8 @@ def _form() -> type[Part]:
 
 
 def _check_model(section: str, models: Collection[str], given: Any) -> None:
+    if given is None and section == "tyres":  # they are not known
+        return
     chosen = given.get("model") if isinstance(given, dict) else None
     if chosen not in list(models):
         found = "is missing" if chosen is None else f"= {chosen!r} is unknown"
@@ -345,8 +383,11 @@ def write_car(path: Path | str, car: CarParameters) -> None:
     parts += [(f"tuning.{name}", part) for name, part in car.tuning]
     lines = [f'name = "{car.name}"']
     for section, part in parts:
+        if part is None:  # tyres that are not known
+            continue
         names = SECTIONS.get(section) or type(part).model_fields
-        lines += ["", f"[{section}]", *(_line(part, name) for name in names)]
+        given = [name for name in names if getattr(part, name) is not None]
+        lines += ["", f"[{section}]", *(_line(part, name) for name in given)]
     write_whole(Path(path), "\n".join(lines) + "\n")
 
 

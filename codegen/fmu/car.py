@@ -60,7 +60,7 @@ def _title(car: CarParameters) -> str:
 def _parameters(car: CarParameters, kind: str) -> list[Variable]:
     """With bounds, unit and description of the car's own data model; limits for the guard only."""
     fields: dict[str, tuple[str, dict[str, Any]]] = {}  # axle, if it is of one, and schema
-    for part in (car, car.tyres, car.drive):
+    for part in (car, car.true_tyres, car.drive):
         schema = type(part).model_json_schema()["properties"]
         for name, value in part:
             if isinstance(value, Pacejka):

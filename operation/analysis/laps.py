@@ -148,11 +148,11 @@ def positions_between(run: Trajectory, car: CarParameters) -> Floats | None:
     The built-in equations go through the same sub-steps again, from each logged state with the
     input that acted: in lockstep these are the plant's own states. In real time an input may change
     within a period, and its mean is what is logged; the car is then off by tenths of a millimetre.
-    None where the samples are not evenly spaced, or where they are not those of the built-in
-    equations.
+    None where the samples are not evenly spaced, or are not those of the built-in equations, or
+    where these are not known of the car.
     """
     steps = np.round(np.diff(run.time_s) * PLANT_SUBSTEP_HZ).astype(int)
-    if not len(steps) or steps.min() < 1 or np.ptp(steps):
+    if not car.identified or not len(steps) or steps.min() < 1 or np.ptp(steps):
         return None
     places = _integrated(run.x[:-1], run.u, car, int(steps[0]))
     missed = np.linalg.norm(places[:, -1] - run.x[1:, :2], axis=1)

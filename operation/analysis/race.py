@@ -266,7 +266,7 @@ def _summary(recording: Recording) -> SettingsSummary:
     other = "" if settings.simulator == "equations" else settings.simulator
     return SettingsSummary(
         car=settings.car.name,
-        tyres=settings.car.tyres.model,
+        tyres=settings.car.tyres.model if settings.car.tyres else "",
         friction=line.made_for.friction if line.made_for else None,
         track=Path(settings.track).stem,
         train_track=Path(settings.train_track).stem,

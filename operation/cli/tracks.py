@@ -203,7 +203,7 @@ def limit(
         + f"; {100 * lap.mesh_change:.3f} % from half the intervals to {lap.intervals}, "
         f"solved in {lap.solve_s:.1f} s" + ("" if out is None else f": {out}")
     )
-    if parameters.tyres.model == "linear":
+    if not parameters.has_limit:
         typer.echo("a lap of the equations, not of a car: linear tyres have no limit")
     if out is not None:
         write_limit(out, lap)
