@@ -65,7 +65,7 @@ class Compiler:
         archives: list[Path],
         out: Path,
         flags: tuple[str, ...] = FLAGS,
-        exports: str = "br_mpc_*; br_cycle_*",
+        exports: str = "br_mpc_*; br_cycle_*; br_estimator_*",
     ) -> None:
         """Compiles ``sources``, as many at once as there are processors, and links them with
         ``archives``; hides all symbols but ``exports``, patterns with semicolons between."""

@@ -348,6 +348,21 @@ class NativeProblem:
         self._check(error, "predict")
         return x_next
 
+    def propagate(
+        self, x: Floats, u: Floats, duration_s: float, variance: Floats
+    ) -> tuple[Floats, Floats, Floats]:
+        """State (nx,) after at most a stage with u (nu,) held, its Jacobian (nx, nx) in x, and the
+        covariance (nx, nx) that the residual's ``variance`` (ne,) adds."""
+        nx, problem = self._nx, self.manifest.problem
+        given = self._given("x", x, nx), self._given("u", u, self._nu)
+        known = self._given("variance", variance, problem.outputs)
+        made = self._made(nx), self._made(nx, nx), self._made(nx, nx)
+        results = (result for _, result in made)
+        error = self._library.br_mpc_propagate(self.handle, *given, duration_s, known, *results)
+        self._check(error, "propagate")
+        (x_next, _), (jacobian, _), (covariance, _) = made
+        return x_next, jacobian, covariance
+
     def read_plan(self) -> tuple[Floats, Floats]:
         """The last plan, x (N + 1, nx) and u (N, nu), in buffers that the next call overwrites."""
         self._library.br_mpc_get_plan(self.handle, self._plan_x, self._plan_u)

@@ -14,7 +14,25 @@ __all__ = ["c_header", "functions"]
 
 def functions(problem: Problem) -> list[ca.Function]:
     """Everything that the runtime calls, named ``br_...``."""
-    return [*_derivatives(problem.linearise), problem.advance, *_parts(problem)]
+    return [
+        *_derivatives(problem.linearise),
+        problem.advance,
+        _transition(problem.advance),
+        *_parts(problem),
+    ]
+
+
+def _transition(advance: ca.Function) -> ca.Function:
+    """(x, u, e, h) -> x_next, and its transposed Jacobian in x and e."""
+    kind: Any = ca.SX if advance.is_a("SXFunction") else ca.MX
+    names = ["x", "u", "e", "h"]
+    x, u, e, h = (kind.sym(name, advance.size1_in(i)) for i, name in enumerate(names))
+    x_next = advance(x, u, e, h)
+    jacobian = ca.densify(ca.jacobian(x_next, ca.vertcat(x, e)).T)
+    made = [ca.densify(x_next), jacobian]
+    return ca.Function(
+        "br_transit", [x, u, e, h], made, names, ["x_next", "jacobian"], {"cse": True}
+    )
 
 
 def _derivatives(linearise: ca.Function) -> list[ca.Function]:

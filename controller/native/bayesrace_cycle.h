@@ -19,6 +19,7 @@
 
 #include <stdint.h>
 
+#include "bayesrace_estimator.h"
 #include "bayesrace_mpc.h"
 
 #ifdef __cplusplus

@@ -297,6 +297,15 @@ BR_API br_mpc_error br_mpc_prepare(br_mpc *mpc, double elapsed_s, double budget_
 BR_API br_mpc_error br_mpc_predict(const br_mpc *mpc, const double x[BR_NX], const double u[BR_NU],
                                    double duration_s, double x_next[BR_NX]);
 
+/* The same over at most a stage (BR_TS), with what an estimator needs: how x_next changes with x
+ * while no limit is reached, row by row, and the covariance that the residual's variance (per
+ * stage; NULL: 0) adds, whose errors are taken to be independent from one stage to the next. */
+BR_API br_mpc_error br_mpc_propagate(const br_mpc *mpc, const double x[BR_NX],
+                                     const double u[BR_NU], double duration_s,
+                                     const double variance[BR_NE], double x_next[BR_NX],
+                                     double jacobian[BR_NX * BR_NX],
+                                     double covariance[BR_NX * BR_NX]);
+
 #if BR_HAS_PATH
 /* The steering angle that keeps a car in state x by its line while it brakes to standstill.
  * *s_m: arc length of the line near which x is sought, below 0 for anywhere; that of x on return.

@@ -180,6 +180,7 @@ typedef struct {
     __typeof__(br_mpc_prepare) *prepare;
     __typeof__(br_mpc_rehearse) *rehearse;
     __typeof__(br_mpc_predict) *predict;
+    __typeof__(br_mpc_propagate) *propagate;
 #if BR_HAS_PATH
     __typeof__(br_mpc_steer) *steer;
 #endif
@@ -333,6 +334,7 @@ BR_PART void br_stages_variances(const br_gp *gp, int stages, double (*x)[BR_NX]
 BR_PART void br_stage_advance(const br_gp *gp, const double x[BR_NX], const double u[BR_NU],
                               double duration, double x_next[BR_NX]);
 BR_PART __typeof__(br_mpc_predict) br_predict;
+BR_PART __typeof__(br_mpc_propagate) br_propagate;
 BR_PART __typeof__(br_mpc_variance) br_variance;
 BR_PART __typeof__(br_mpc_evaluate) br_evaluate;
 /* br_predict by these weights; gp NULL: without correction. */

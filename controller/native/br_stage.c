@@ -208,6 +208,41 @@ br_mpc_error br_predict_by(const br_mpc *mpc, const br_gp *gp, const double x[BR
     return BR_OK;
 }
 
+br_mpc_error br_propagate(const br_mpc *mpc, const double x[BR_NX], const double u[BR_NU],
+                          double duration_s, const double variance[BR_NE], double x_next[BR_NX],
+                          double jacobian[BR_NX * BR_NX], double covariance[BR_NX * BR_NX]) {
+    if (!x || !u || !x_next || !jacobian || !covariance) return BR_ERROR_NULL;
+    if (!mpc->has_parameters) return BR_ERROR_NOT_READY;
+    if (!(duration_s > 0 && duration_s <= BR_TS * (1 + PART_MIN))) return BR_ERROR_TIME;
+    if (!br_plausible_state(x) || !br_all_finite(u, BR_NU)) return BR_ERROR_STATE;
+    const double *theta = br_theta(&mpc->parameters), share = duration_s / BR_TS;
+    const br_gp *gp = &mpc->gp[mpc->gp_in_use];
+    double acting[BR_NU], mean[BR_NE], unlimited[BR_NX], in_w[BR_NX][BR_NX + BR_NE];
+    double z[1][BR_NZ];
+    BR_ALIGNED br_gp_row kernels[BR_NE * BR_GP_BLOCKS];
+    br_correction residual = {0};
+    BR_CALL(br_acting, BR_LIST(x, u, &duration_s, theta), BR_LIST(acting));
+    br_stage_features(x, acting, z[0]);
+    if (gp->any) br_gp_evaluate(gp, 1, z, kernels, 1, &residual);
+    for (int j = 0; j < BR_NE; ++j) mean[j] = share * residual.mean[j];
+    BR_CALL(br_transit, BR_LIST(x, acting, mean, &duration_s), BR_LIST(unlimited, in_w[0]));
+    for (int i = 0; i < BR_NX; ++i)
+        for (int l = 0; l < BR_NX; ++l) {
+            double added = 0;
+            for (int j = 0; variance && j < BR_NE; ++j)
+                added += in_w[i][BR_NX + j] * in_w[l][BR_NX + j] * share * variance[j];
+            covariance[BR_NX * i + l] = added;
+            jacobian[BR_NX * i + l] = in_w[i][l];
+        }
+    for (int a = 0; a < BR_NZ; ++a)
+        for (int j = 0; BR_FEATURE[a] < BR_NX && j < BR_NE; ++j)
+            for (int i = 0; i < BR_NX; ++i)
+                jacobian[BR_NX * i + BR_FEATURE[a]] +=
+                    in_w[i][BR_NX + j] * share * residual.gradient[j][a];
+    BR_CALL(br_reached, BR_LIST(unlimited, theta), BR_LIST(x_next));
+    return br_plausible_state(x_next) ? BR_OK : BR_ERROR_STATE;
+}
+
 /* --- the model and its uncertainty at one stage, for tests and tools --- */
 
 br_mpc_error br_variance(br_mpc *mpc, const double v[BR_NV], double variance[BR_NE]) {

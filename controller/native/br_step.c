@@ -444,6 +444,7 @@ const br_code BR_CODE = {.step = br_step,
                          .prepare = br_prepare,
                          .rehearse = br_rehearse,
                          .predict = br_predict,
+                         .propagate = br_propagate,
 #if BR_HAS_PATH
                          .steer = br_steer,
 #endif

@@ -1,0 +1,91 @@
+"""From what sensors say to the state of the car: the estimator in C (bayesrace_estimator.h)."""
+
+from collections.abc import Sequence
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+
+from bayesrace.arrays import Floats
+from bayesrace.controller.native_step import NativeProblem
+
+__all__ = ["Belief", "Estimator", "Measurement"]
+
+
+class Measurement(NamedTuple):
+    """What one instrument has measured at one moment of plant time."""
+
+    time_s: float
+    instrument: int
+    """Its number, from 0 on."""
+    of: Sequence[int]
+    """Indices of the states that are measured, each once."""
+    value: Sequence[float]
+    deviation: Sequence[float]
+    """Standard deviations, in the unit of each value."""
+
+
+class Belief(NamedTuple):
+    """State and offsets of sensors, with their covariance."""
+
+    time_s: float
+    x: Floats
+    """(nx + 2,): the states, then the offsets of the measured yaw rate and steering angle."""
+    covariance: Floats
+    """(nx + 2, nx + 2)"""
+
+
+class Estimator:
+    """An extended Kalman filter over the model and the weights of a step; for its thread."""
+
+    def __init__(self, step: NativeProblem, start: Floats, drift: Floats, gate: float) -> None:
+        """``start``, ``drift`` (nx + 2,), ``gate``: as in br_estimation; InputError if unusable."""
+        artefact, self._step = step.artefact, step  # whose memory has to stay
+        self._library, self._ffi, self._check = artefact.library, artefact.ffi, artefact.check
+        size = self._library.br_estimator_memory_size()
+        self._memory, handle = artefact.memory(size), self._ffi.new("br_estimator **")
+        error = self._library.br_estimator_init(self._memory, size, step.handle, handle)
+        self._check(error, "estimator")
+        self.handle: Final = handle[0]
+        settings = {"start": list(start), "drift": list(drift), "gate": gate}
+        error = self._library.br_estimator_set(
+            self.handle, self._ffi.new("br_estimation *", settings)
+        )
+        self._check(error, "estimator's settings")
+        self._belief = self._ffi.new("br_belief *")
+
+    def advance(
+        self, time_s: float, u: Floats, variance: Floats, measured: Sequence[Measurement]
+    ) -> bool:
+        """The period that ends at ``time_s`` is over; whether anything is known yet.
+
+        ``u`` (nu,) acted in it; ``variance`` (ne,): of the residual, per stage. InputError for a
+        time before the last one.
+        """
+        given = self._ffi.new("br_measurement[]", len(measured))
+        for one, row in zip(given, measured, strict=True):
+            one.time_s, one.instrument, one.count = row.time_s, row.instrument, len(row.of)
+            for i, values in enumerate(zip(row.of, row.value, row.deviation, strict=True)):
+                one.of[i], one.value[i], one.deviation[i] = values
+        numbers = (
+            self._ffi.from_buffer("double[]", np.ascontiguousarray(one, dtype=np.float64))
+            for one in (u, variance)
+        )
+        error = self._library.br_estimator_advance(
+            self.handle, time_s, *numbers, given, len(measured)
+        )
+        if error == self._library.BR_ERROR_NOT_READY:
+            return False
+        self._check(error, "estimator")
+        return True
+
+    def read(self) -> Belief:
+        """At the end of the last period; InputError while nothing is known."""
+        self._check(self._library.br_estimator_read(self.handle, self._belief), "estimator")
+        found, number = self._belief, np.float64
+        x = np.frombuffer(self._ffi.buffer(found.x), number).copy()
+        covariance = np.frombuffer(self._ffi.buffer(found.covariance), number).copy()
+        return Belief(found.time_s, x, covariance.reshape(len(x), len(x)))
+
+    def instrument(self, number: int) -> Any:
+        """What has become of an instrument's measurements: a br_instrument."""
+        return self._library.br_estimator_instrument(self.handle, number)

@@ -1,0 +1,95 @@
+/* BayesRace state estimator: from what sensors say to the state of the car.
+ *
+ * An extended Kalman filter over the controller's own corrected model (br_mpc_propagate), with the
+ * weights in use. Instruments measure some of the states at a time, whenever they do, and may say
+ * so late: what came after is then done over. Two offsets are estimated beside the states: of the
+ * measured yaw rate (a gyro's) and of the measured steering angle.
+ *
+ *   br_estimator_advance(estimator, time_s, u, variance, measurements, count);   each period
+ *   br_estimator_read(estimator, &belief);
+ *
+ * As with br_mpc, an estimator lives in memory of the caller's, allocates nothing, and is for one
+ * thread: that of the controller's steps. Times are the plant's, units SI.
+ */
+#ifndef BAYESRACE_ESTIMATOR_H
+#define BAYESRACE_ESTIMATOR_H
+
+#include <stdint.h>
+
+#include "bayesrace_mpc.h"
+
+#ifdef __cplusplus
+extern "C" {
+#endif
+
+#define BR_OFFSETS 2               /* of yaw rate and steering angle, in this order */
+#define BR_NB (BR_NX + BR_OFFSETS) /* what is estimated */
+#define BR_INSTRUMENTS 8
+#define BR_EVENTS 64 /* of the newest periods and measurements that are kept to be done over */
+
+/* What one instrument has measured at one moment. */
+typedef struct {
+    double time_s;
+    int instrument;          /* its number, below BR_INSTRUMENTS */
+    int count;               /* values that belong together, 1 to BR_NX: */
+    int of[BR_NX];           /* the states that they are of, each once */
+    double value[BR_NX];     /* a heading may be off by whole turns */
+    double deviation[BR_NX]; /* standard deviations; errors of one moment are independent */
+} br_measurement;
+
+/* What is assumed. */
+typedef struct {
+    double start[BR_NB]; /* standard deviations of what has not been measured yet, around 0; an
+                          * offset with 0 is none */
+    double drift[BR_NB]; /* random walk beyond the model's own uncertainty [unit/sqrt(s)] */
+    double gate;         /* a measurement is refused beyond so many times the squared distance that
+                          * one of 1,000 exceeds (chi-squared); 0: none is */
+} br_estimation;
+
+/* State with its covariance. */
+typedef struct {
+    double time_s;
+    double x[BR_NB];
+    double covariance[BR_NB * BR_NB];
+} br_belief;
+
+/* What has become of one instrument's measurements. */
+typedef struct {
+    int64_t used, refused;    /* refused: by the gate */
+    int64_t lost;             /* from the future, or from before what is kept */
+    int refused_in_row;       /* of the newest */
+    double squared, expected; /* of those used, at first: sums of the squared distances by the
+                               * covariance of what is new in them, and of how many values they
+                               * had; equal where all covariances are true */
+} br_instrument;
+
+typedef struct br_estimator br_estimator;
+
+BR_API size_t br_estimator_memory_size(void);
+BR_API br_mpc_error br_estimator_init(void *memory, size_t size, const br_mpc *mpc,
+                                      br_estimator **out);
+
+/* BR_ERROR_PARAMETERS, and nothing changes, for numbers that are negative or not finite. Begins
+ * anew. */
+BR_API br_mpc_error br_estimator_set(br_estimator *estimator, const br_estimation *settings);
+
+/* Knows nothing any more; counts stay. */
+BR_API void br_estimator_reset(br_estimator *estimator);
+
+/* The period that ends at time_s is over: u acted in it, and so much has been measured, in it or
+ * before. variance: of the residual, per stage; NULL: 0. It begins with a position and heading that
+ * are measured together. BR_ERROR_NOT_READY while it has not begun; BR_ERROR_TIME if time_s is not
+ * after the period before, BR_ERROR_STATE if the model cannot follow: it then begins anew. */
+BR_API br_mpc_error br_estimator_advance(br_estimator *estimator, double time_s,
+                                         const double u[BR_NU], const double variance[BR_NE],
+                                         const br_measurement *measurements, int count);
+
+/* At the end of the last period. */
+BR_API br_mpc_error br_estimator_read(const br_estimator *estimator, br_belief *belief);
+
+BR_API const br_instrument *br_estimator_instrument(const br_estimator *estimator, int number);
+
+#ifdef __cplusplus
+}
+#endif
+#endif

@@ -1,0 +1,358 @@
+/* Extended Kalman filter with a history of its events.
+ *
+ * An event is the end of a period, or a measurement within one. Each keeps what was believed after
+ * it, so a measurement that comes late is put where it belongs, and what follows is done over. The
+ * covariance is updated in Joseph's form, which keeps it positive in the presence of rounding
+ * (Bar-Shalom, Li, Kirubarajan, "Estimation with Applications to Tracking and Navigation", section
+ * 5.2.3 for the filter, 5.4 for the gate).
+ */
+#include "bayesrace_estimator.h"
+
+#include <math.h>
+#include <stdint.h>
+#include <string.h>
+
+#if BR_HAS_PATH
+
+#define SAME_S 1e-9 /* times closer than that are one */
+
+/* Chi-squared that one of 1,000 exceeds, by degrees of freedom from 1 on. */
+static const double EXCEEDED[] = {10.828, 13.816, 16.266, 18.467, 20.515, 22.458, 24.322};
+_Static_assert(sizeof EXCEEDED / sizeof EXCEEDED[0] >= BR_NX, "a bound for each number of values");
+
+typedef struct {
+    double x[BR_NB], p[BR_NB][BR_NB];
+} belief;
+
+typedef struct {
+    double time_s, u[BR_NU], variance[BR_NE]; /* u acted since the event before */
+    br_measurement measured;                  /* count 0: the end of a period */
+    int judged;                               /* it is in the counts of its instrument */
+    belief after;
+} event;
+
+struct br_estimator {
+    const br_mpc *mpc;
+    br_estimation settings;
+    int has_settings;
+    int count; /* of events, the oldest first; 0: it has not begun */
+    int order[BR_EVENTS];
+    event events[BR_EVENTS];
+    br_instrument instrument[BR_INSTRUMENTS];
+};
+
+size_t br_estimator_memory_size(void) { return sizeof(br_estimator); }
+
+br_mpc_error br_estimator_init(void *memory, size_t size, const br_mpc *mpc, br_estimator **out) {
+    if (!memory || !mpc || !out) return BR_ERROR_NULL;
+    if (size < sizeof(br_estimator) || (uintptr_t)memory % _Alignof(br_estimator))
+        return BR_ERROR_MEMORY;
+    br_estimator *estimator = memory;
+    memset(estimator, 0, sizeof *estimator);
+    for (int i = 0; i < BR_EVENTS; ++i) estimator->order[i] = i;
+    estimator->mpc = mpc;
+    *out = estimator;
+    return BR_OK;
+}
+
+br_mpc_error br_estimator_set(br_estimator *estimator, const br_estimation *settings) {
+    if (!estimator || !settings) return BR_ERROR_NULL;
+    int valid = isfinite(settings->gate) && settings->gate >= 0;
+    for (int i = 0; i < BR_NB; ++i)
+        valid &= isfinite(settings->start[i]) && settings->start[i] >= 0 &&
+                 isfinite(settings->drift[i]) && settings->drift[i] >= 0;
+    if (!valid) return BR_ERROR_PARAMETERS;
+    estimator->settings = *settings;
+    estimator->has_settings = 1;
+    br_estimator_reset(estimator);
+    return BR_OK;
+}
+
+void br_estimator_reset(br_estimator *estimator) {
+    if (estimator) estimator->count = 0;
+}
+
+static event *at(br_estimator *estimator, int k) { return &estimator->events[estimator->order[k]]; }
+
+/* --- between two events --- */
+
+/* x and P after a duration of at most a stage, under u. */
+static br_mpc_error propagate(const br_estimator *estimator, const event *by, double duration,
+                              belief *b) {
+    double f[BR_NX * BR_NX], q[BR_NX * BR_NX], fp[BR_NX][BR_NB];
+    const br_mpc_error error =
+        br_mpc_propagate(estimator->mpc, b->x, by->u, duration, by->variance, b->x, f, q);
+    if (error) return error;
+    for (int i = 0; i < BR_NX; ++i)
+        for (int j = 0; j < BR_NB; ++j) {
+            fp[i][j] = 0;
+            for (int l = 0; l < BR_NX; ++l) fp[i][j] += f[BR_NX * i + l] * b->p[l][j];
+        }
+    for (int i = 0; i < BR_NX; ++i) {
+        for (int j = i; j < BR_NX; ++j) {
+            double sum = q[BR_NX * i + j];
+            for (int l = 0; l < BR_NX; ++l) sum += fp[i][l] * f[BR_NX * j + l];
+            b->p[i][j] = b->p[j][i] = sum;
+        }
+        for (int j = BR_NX; j < BR_NB; ++j) b->p[i][j] = b->p[j][i] = fp[i][j];
+    }
+    for (int i = 0; i < BR_NB; ++i) {
+        const double drift = estimator->settings.drift[i];
+        if (i < BR_NX || estimator->settings.start[i] > 0) b->p[i][i] += duration * drift * drift;
+    }
+    return BR_OK;
+}
+
+static br_mpc_error reach(const br_estimator *estimator, const event *by, double duration,
+                          belief *b) {
+    br_mpc_error error = BR_OK;
+    for (; duration > BR_TS + SAME_S && !error; duration -= BR_TS)
+        error = propagate(estimator, by, BR_TS, b);
+    return error || duration < SAME_S ? error : propagate(estimator, by, fmin(duration, BR_TS), b);
+}
+
+/* --- a measurement --- */
+
+/* The offset that is in what is measured of a state; -1: none. */
+static int offset_in(int state) {
+    return state == BR_INDEX_OMEGA ? BR_NX : state == BR_INDEX_DELTA ? BR_NX + 1 : -1;
+}
+
+/* Column of P H', or row of H P. */
+static double observed(const double row[BR_NB], int state) {
+    const int offset = offset_in(state);
+    return row[state] + (offset < 0 ? 0 : row[offset]);
+}
+
+/* Lower Cholesky factor in place; 0 if there is none. */
+static int factorise(int n, double s[BR_NX][BR_NX]) {
+    for (int j = 0; j < n; ++j) {
+        for (int i = j; i < n; ++i) {
+            double sum = s[i][j];
+            for (int l = 0; l < j; ++l) sum -= s[i][l] * s[j][l];
+            if (i == j && !(sum > 0)) return 0;
+            s[i][j] = i == j ? sqrt(sum) : sum / s[j][j];
+        }
+    }
+    return 1;
+}
+
+/* v <- S^-1 v, by the factor. */
+static void solve(int n, double s[BR_NX][BR_NX], double v[BR_NX]) {
+    for (int i = 0; i < n; ++i) {
+        for (int l = 0; l < i; ++l) v[i] -= s[i][l] * v[l];
+        v[i] /= s[i][i];
+    }
+    for (int i = n - 1; i >= 0; --i) {
+        for (int l = i + 1; l < n; ++l) v[i] -= s[l][i] * v[l];
+        v[i] /= s[i][i];
+    }
+}
+
+/* P <- (I - K H) P (I - K H)' + K R K' */
+static void update(const br_measurement *m, double k[BR_NB][BR_NX], belief *b) {
+    double left[BR_NB][BR_NB];
+    for (int i = 0; i < BR_NB; ++i)
+        for (int j = 0; j < BR_NB; ++j) {
+            left[i][j] = b->p[i][j];
+            for (int a = 0; a < m->count; ++a) left[i][j] -= k[i][a] * observed(b->p[j], m->of[a]);
+        }
+    for (int i = 0; i < BR_NB; ++i)
+        for (int j = i; j < BR_NB; ++j) {
+            double sum = left[i][j];
+            for (int a = 0; a < m->count; ++a)
+                sum += k[j][a] *
+                       (m->deviation[a] * m->deviation[a] * k[i][a] - observed(left[i], m->of[a]));
+            b->p[i][j] = b->p[j][i] = sum;
+        }
+}
+
+/* What the measurement says beyond what is believed; its squared distance by the covariance of
+ * that. -1: refused, and nothing changes. */
+static double take(const br_estimation *settings, const br_measurement *m, belief *b) {
+    const int n = m->count;
+    double s[BR_NX][BR_NX], k[BR_NB][BR_NX], difference[BR_NX], weighted[BR_NX], squared = 0;
+    for (int a = 0; a < n; ++a) {
+        difference[a] = m->value[a] - observed(b->x, m->of[a]);
+        if (m->of[a] == BR_INDEX_PSI) difference[a] = remainder(difference[a], 2 * M_PI);
+        weighted[a] = difference[a];
+        for (int i = 0; i < BR_NB; ++i) k[i][a] = observed(b->p[i], m->of[a]);
+    }
+    for (int a = 0; a < n; ++a)
+        for (int c = 0; c < n; ++c) {
+            const int offset = offset_in(m->of[a]);
+            s[a][c] = k[m->of[a]][c] + (offset < 0 ? 0 : k[offset][c]);
+            if (a == c) s[a][c] += m->deviation[a] * m->deviation[a];
+        }
+    if (!factorise(n, s)) return -1;
+    solve(n, s, weighted);
+    for (int a = 0; a < n; ++a) squared += difference[a] * weighted[a];
+    if (!(squared >= 0) || (settings->gate > 0 && squared > settings->gate * EXCEEDED[n - 1]))
+        return -1;
+    for (int i = 0; i < BR_NB; ++i) {
+        for (int a = 0; a < n; ++a) b->x[i] += k[i][a] * weighted[a];
+        solve(n, s, k[i]); /* P H' S^-1 */
+    }
+    update(m, k, b);
+    return squared;
+}
+
+/* --- events --- */
+
+static int valid(const br_measurement *m) {
+    if (!isfinite(m->time_s) || m->instrument < 0 || m->instrument >= BR_INSTRUMENTS ||
+        m->count < 1 || m->count > BR_NX)
+        return 0;
+    unsigned seen = 0;
+    for (int a = 0; a < m->count; ++a) {
+        if (m->of[a] < 0 || m->of[a] >= BR_NX || (seen >> m->of[a] & 1)) return 0;
+        seen |= 1u << m->of[a];
+        if (!isfinite(m->value[a]) || !(isfinite(m->deviation[a]) && m->deviation[a] > 0)) return 0;
+    }
+    return 1;
+}
+
+/* Puts an event before the k-th; the oldest one makes room. Returns where it is now. */
+static int insert(br_estimator *estimator, int k, const event *given) {
+    if (estimator->count == BR_EVENTS) {
+        const int oldest = estimator->order[0];
+        memmove(estimator->order, estimator->order + 1, (BR_EVENTS - 1) * sizeof(int));
+        estimator->order[BR_EVENTS - 1] = oldest;
+        estimator->count -= 1;
+        k -= 1;
+    }
+    const int free = estimator->order[estimator->count];
+    memmove(estimator->order + k + 1, estimator->order + k, (estimator->count - k) * sizeof(int));
+    estimator->order[k] = free;
+    estimator->events[free] = *given;
+    estimator->count += 1;
+    return k;
+}
+
+/* The earliest of these that is of position and heading; NULL: none is. */
+static const br_measurement *first_pose(const br_measurement *measurements, int count,
+                                        double latest_s) {
+    const unsigned pose = 1u << BR_INDEX_X | 1u << BR_INDEX_Y | 1u << BR_INDEX_PSI;
+    const br_measurement *first = NULL;
+    for (const br_measurement *m = measurements; m < measurements + count; ++m) {
+        unsigned seen = 0;
+        if (!valid(m) || m->time_s > latest_s || (first && m->time_s >= first->time_s)) continue;
+        for (int a = 0; a < m->count; ++a) seen |= 1u << m->of[a];
+        if ((seen & pose) == pose) first = m;
+    }
+    return first;
+}
+
+static void begin(br_estimator *estimator, const br_measurement *m) {
+    event first = {.time_s = m->time_s};
+    belief *b = &first.after;
+    for (int i = 0; i < BR_NB; ++i)
+        b->p[i][i] = estimator->settings.start[i] * estimator->settings.start[i];
+    for (int a = 0; a < m->count; ++a) {
+        const int i = m->of[a];
+        b->x[i] = m->value[a];
+        b->p[i][i] = m->deviation[a] * m->deviation[a];
+        if (offset_in(i) >= 0) { /* its offset is not told apart yet */
+            const int offset = offset_in(i);
+            b->p[i][i] += b->p[offset][offset];
+            b->p[i][offset] = b->p[offset][i] = -b->p[offset][offset];
+        }
+    }
+    estimator->instrument[m->instrument].used += 1;
+    insert(estimator, 0, &first);
+}
+
+/* Puts a measurement where it belongs; the place, or -1 where it is lost. */
+static int place(br_estimator *estimator, const br_measurement *m) {
+    const int last = estimator->count - 1;
+    if (!valid(m)) return -1;
+    if (m->time_s > at(estimator, last)->time_s + SAME_S ||
+        m->time_s < at(estimator, 0)->time_s - SAME_S)
+        return -1;
+    int k = last;
+    while (k > 1 && at(estimator, k - 1)->time_s > m->time_s) --k;
+    if (k == 0) return -1;           /* nothing has been since the first */
+    event given = *at(estimator, k); /* the input is that of its period */
+    given.time_s = fmin(fmax(m->time_s, at(estimator, k - 1)->time_s), given.time_s);
+    given.measured = *m;
+    return insert(estimator, k, &given);
+}
+
+/* A measurement has been taken, or refused. */
+static void count(br_estimator *estimator, event *one, double squared) {
+    br_instrument *instrument = &estimator->instrument[one->measured.instrument];
+    if (one->judged) return;
+    one->judged = 1;
+    if (squared < 0) {
+        instrument->refused += 1;
+        instrument->refused_in_row += 1;
+        return;
+    }
+    instrument->used += 1;
+    instrument->refused_in_row = 0;
+    instrument->squared += squared;
+    instrument->expected += one->measured.count;
+}
+
+/* Everything from the k-th event on is done over. */
+static br_mpc_error redo(br_estimator *estimator, int k) {
+    for (; k < estimator->count; ++k) {
+        event *one = at(estimator, k);
+        const event *before = at(estimator, k - 1);
+        one->after = before->after;
+        const br_mpc_error error = reach(estimator, one, one->time_s - before->time_s, &one->after);
+        if (error) return error;
+        if (!one->measured.count) continue;
+        count(estimator, one, take(&estimator->settings, &one->measured, &one->after));
+    }
+    return BR_OK;
+}
+
+br_mpc_error br_estimator_advance(br_estimator *estimator, double time_s, const double u[BR_NU],
+                                  const double variance[BR_NE], const br_measurement *measurements,
+                                  int count) {
+    if (!estimator || !u || (count > 0 && !measurements)) return BR_ERROR_NULL;
+    if (!estimator->has_settings) return BR_ERROR_NOT_READY;
+    if (!isfinite(time_s)) return BR_ERROR_TIME;
+    const br_measurement *first = NULL;
+    if (!estimator->count) {
+        first = first_pose(measurements, count, time_s + SAME_S);
+        if (!first) return BR_ERROR_NOT_READY;
+        begin(estimator, first);
+    }
+    if (time_s < at(estimator, estimator->count - 1)->time_s - SAME_S) return BR_ERROR_TIME;
+    event end = {.time_s = time_s};
+    memcpy(end.u, u, sizeof end.u);
+    if (variance) memcpy(end.variance, variance, sizeof end.variance);
+    int from = insert(estimator, estimator->count, &end);
+    for (const br_measurement *m = measurements; m < measurements + count; ++m) {
+        if (m == first) continue;
+        const int size = estimator->count, k = place(estimator, m), number = m->instrument;
+        if (k >= 0) {
+            from -= estimator->count == size; /* the oldest has made room */
+            from = k < from ? k : from;
+        } else if (number >= 0 && number < BR_INSTRUMENTS) {
+            estimator->instrument[number].lost += 1;
+        }
+    }
+    const br_mpc_error error = redo(estimator, from > 1 ? from : 1);
+    if (error) br_estimator_reset(estimator);
+    return error;
+}
+
+br_mpc_error br_estimator_read(const br_estimator *estimator, br_belief *out) {
+    if (!estimator || !out) return BR_ERROR_NULL;
+    if (!estimator->count) return BR_ERROR_NOT_READY;
+    const event *last = &estimator->events[estimator->order[estimator->count - 1]];
+    out->time_s = last->time_s;
+    memcpy(out->x, last->after.x, sizeof out->x);
+    memcpy(out->covariance, last->after.p, sizeof out->covariance);
+    return BR_OK;
+}
+
+const br_instrument *br_estimator_instrument(const br_estimator *estimator, int number) {
+    if (!estimator || number < 0 || number >= BR_INSTRUMENTS) return NULL;
+    return &estimator->instrument[number];
+}
+
+#endif

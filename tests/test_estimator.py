@@ -1,0 +1,287 @@
+"""The state estimator in C against a textbook filter in NumPy, and on a learned car's own lap."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bayesrace.arrays import Floats
+from bayesrace.controller.estimator import Belief, Estimator, Measurement
+from bayesrace.controller.native_step import NativeStep
+from bayesrace.errors import InputError
+from bayesrace.gp.expression import mean_function
+from bayesrace.gp.weights import GpWeights
+from bayesrace.integrators import PREDICTION
+from bayesrace.vehicles import CarParameters
+from bayesrace.vehicles.models import e_kinematic
+from tests.conftest import SETTINGS, Make, smooth_drive
+from tests.racing import Racing, racing
+
+TS = 0.02
+POSE, GYRO, WHEEL, STEERING = range(4)
+START = np.array([1, 1, 3, 0.5, 0.2, 1, 0.05, 0.1, 0.02])
+DRIFT = np.array([0, 0, 0, 0.005, 0.005, 0.05, 0, 0, 0])
+VARIANCE = np.array([4e-6, 9e-6, 4e-3])
+TURN, SHIFT = 0.05, 0.01
+"""Offsets of yaw rate and steering angle as measured."""
+
+
+def of_pose(time_s: float, x: Floats, mm: float = 0.5, degrees: float = 0.2) -> Measurement:
+    deviation = (1e-3 * mm, 1e-3 * mm, np.deg2rad(degrees))
+    return Measurement(time_s, POSE, (0, 1, 2), tuple(x[:3]), deviation)
+
+
+def noisy(random: np.random.Generator, one: Measurement) -> Measurement:
+    return one._replace(value=tuple(random.normal(one.value, one.deviation)))
+
+
+@dataclass
+class Textbook:
+    """The same filter, dense and by inverses, with all events in order; it has no history."""
+
+    step: NativeStep
+    x: Floats
+    p: Floats
+    time_s: float
+    squared: list[float] = field(default_factory=list)
+
+    @classmethod
+    def begun(cls, step: NativeStep, first: Measurement) -> "Textbook":
+        p = np.diag(START**2)
+        p[:3, :3] = np.diag(np.square(first.deviation))
+        return cls(step, np.r_[first.value, np.zeros(6)], p, first.time_s)
+
+    def reach(self, time_s: float, u: Floats) -> None:
+        left = time_s - self.time_s
+        while left > 1e-9:
+            h = min(left, TS)
+            f, q = np.eye(9), np.diag(DRIFT**2 * h)
+            self.x[:7], f[:7, :7], added = self.step.propagate(self.x[:7], u, h, VARIANCE)
+            q[:7, :7] += added
+            self.p = f @ self.p @ f.T + q
+            left -= h
+        self.time_s = time_s
+
+    def take(self, m: Measurement) -> None:
+        h = np.zeros((len(m.of), 9))
+        h[range(len(m.of)), m.of] = 1
+        h[:, 7] += h[:, 5]
+        h[:, 8] += h[:, 6]
+        new = np.asarray(m.value) - h @ self.x
+        s = h @ self.p @ h.T + np.diag(np.square(m.deviation))
+        gain = self.p @ h.T @ np.linalg.inv(s)
+        self.squared.append(float(new @ np.linalg.solve(s, new)))
+        self.x = self.x + gain @ new
+        self.p = self.p - gain @ s @ gain.T
+
+
+@dataclass
+class Drive:
+    """States every millisecond, the input of each period, and measurements in it by instrument."""
+
+    x: Floats
+    u: Floats
+    measured: list[list[Measurement]]
+
+
+@pytest.fixture
+def drive(car: CarParameters, make: Make) -> Drive:
+    """Pose at 50 Hz, gyro and wheel speed at 200 Hz, steering encoder at 30 Hz, all noisy; by the
+    corrected model itself."""
+    random, step = np.random.default_rng(3), make()
+    _, u = smooth_drive(car, 60, 2)
+    x, dense = np.array([0.3, -0.2, 3.0, 1.5, 0, 0, 0]), []
+    for given in u:
+        dense += [x, *(step.predict(x, given, 1e-3 * k) for k in range(1, 20))]
+        x = step.predict(x, given, TS)
+    states = np.array([*dense, x])
+    measured: list[list[Measurement]] = [[] for _ in range(len(u))]
+    for k in range(1, len(states)):
+        time_s, true, period = 1e-3 * k, states[k], (k - 1) // 20
+        found = []
+        if k % 20 == 7:
+            found.append(of_pose(time_s, true))
+        if k % 5 == 0:
+            found.append(Measurement(time_s, GYRO, (5,), (true[5] + TURN,), (0.02,)))
+            found.append(Measurement(time_s, WHEEL, (3,), (true[3],), (0.01 * max(true[3], 0.1),)))
+        if k % 33 == 0:
+            found.append(Measurement(time_s, STEERING, (6,), (true[6] + SHIFT,), (0.002,)))
+        measured[period] += [noisy(random, one) for one in found]
+    return Drive(states, u, measured)
+
+
+def estimated(estimator: Estimator, drive: Drive, late: int = 0) -> Belief:
+    """Poses but the first come so many periods late."""
+    for k, u in enumerate(drive.u):
+        here = [one for one in drive.measured[k] if one.instrument != POSE]
+        then = drive.measured[max(k - late, 0)] if k in (0, *range(late + 1, len(drive.u))) else []
+        poses = [one for one in then if one.instrument == POSE]
+        estimator.advance(TS * (k + 1), u, VARIANCE, here + poses)
+    return estimator.read()
+
+
+def textbook(step: NativeStep, drive: Drive, late: int = 0) -> Textbook:
+    """What has been measured by the end of the drive."""
+    last = len(drive.u) - late
+    events = [
+        (one.time_s, k, one)
+        for k, period in enumerate(drive.measured)
+        for one in sorted(period, key=lambda one: one.instrument == POSE)
+        if k < last or one.instrument != POSE
+    ]
+    events.sort(key=lambda event: event[0])
+    first = next(one for _, _, one in events if one.instrument == POSE)
+    made = Textbook.begun(step, first)
+    for time_s, k, one in events:
+        if time_s <= first.time_s:
+            continue
+        for period in range(int(made.time_s / TS + 1e-6), k):
+            made.reach(TS * (period + 1), drive.u[period])
+        made.reach(time_s, drive.u[k])
+        made.take(one)
+    made.reach(TS * len(drive.u), drive.u[-1])
+    return made
+
+
+def estimator(step: NativeStep, gate: float = 0.0) -> Estimator:
+    return Estimator(step, START, DRIFT, gate)
+
+
+def test_the_transition_is_the_prediction_with_its_derivatives(
+    make: Make, car: CarParameters, weights: GpWeights
+) -> None:
+    step, e = make(), PREDICTION.corrected(e_kinematic(car))
+    mu = mean_function(weights)
+    states, inputs = smooth_drive(car, 40, 5)
+    for x, u in zip(states[::6], inputs[::6], strict=True):
+        if abs(x[6]) > car.delta_max_rad - 0.11:
+            continue
+        for duration_s in (0.003, TS):
+            x_next, jacobian, covariance = step.propagate(x, u, duration_s, VARIANCE)
+            assert np.array_equal(x_next, step.predict(x, u, duration_s))
+            for i in range(7):
+                h = 1e-6 * np.eye(7)[i]
+                ahead, back = (step.predict(x + d, u, duration_s) for d in (h, -h))
+                assert (ahead - back) / 2e-6 == pytest.approx(jacobian[:, i], abs=2e-6)
+        mean = np.asarray(mu(np.r_[x[3:], u])).ravel()
+        spread = np.column_stack(
+            [(np.array(e(x, u, mean + d)) - np.array(e(x, u, mean - d))).ravel() / 2
+             for d in np.diag(np.sqrt(VARIANCE))]
+        )  # fmt: skip
+        assert spread @ spread.T == pytest.approx(covariance, rel=1e-3, abs=1e-12)
+
+
+@pytest.mark.parametrize("late", [0, 2])
+def test_it_is_the_textbook_filter_with_all_in_order(make: Make, drive: Drive, late: int) -> None:
+    """Asynchronous instruments, offsets, and measurements that come late."""
+    step = make()
+    made, expected = estimator(step), textbook(step, drive, late)
+    found = estimated(made, drive, late)
+    assert found.time_s == pytest.approx(TS * len(drive.u))
+    assert found.x == pytest.approx(expected.x, rel=1e-9, abs=1e-11)
+    scale = np.sqrt(np.outer(np.diag(expected.p), np.diag(expected.p)))
+    assert np.abs((found.covariance - expected.p) / scale).max() < 1e-8
+    if not late:
+        squared = sum(made.instrument(number).squared for number in range(4))
+        assert squared == pytest.approx(sum(expected.squared), rel=1e-8)
+
+
+def test_it_finds_the_offsets_of_gyro_and_steering(make: Make, drive: Drive) -> None:
+    found, error = estimated(estimator(make(), gate=1.0), drive), np.sqrt
+    deviation = error(np.diag(found.covariance))
+    assert abs(found.x[7] - TURN) < 3 * deviation[7] < 0.05
+    assert abs(found.x[8] - SHIFT) < 3 * deviation[8] < 0.01
+    off = np.abs(found.x[:7] - drive.x[-1])
+    off[2] = abs(np.remainder(off[2] + np.pi, 2 * np.pi) - np.pi)
+    assert (off < 4 * deviation[:7]).all()
+
+
+def test_what_cannot_be_is_refused_and_counted(make: Make, drive: Drive) -> None:
+    step = make()
+    expected = estimated(estimator(step, gate=1.0), drive)
+    made, jump = estimator(step, gate=1.0), np.array([1.0, 0, np.pi])
+    for k, u in enumerate(drive.u):
+        bad = []
+        if k % 10 == 5:
+            pose = of_pose(TS * (k + 1), drive.x[20 * (k + 1), :3] + jump)
+            bad = [
+                pose,
+                pose._replace(time_s=TS * (k + 1) + 0.1),
+                pose._replace(time_s=-1.0),
+                pose._replace(value=(np.nan, 0.0, 0.0)),
+                pose._replace(of=(1, 1, 2)),
+            ]
+        made.advance(TS * (k + 1), u, VARIANCE, [*drive.measured[k], *bad])
+    assert made.read().x == pytest.approx(expected.x, abs=1e-9)
+    counts = made.instrument(POSE)
+    assert (counts.used, counts.refused, counts.lost) == (60, 6, 24)
+    assert counts.refused_in_row == 0
+
+
+def test_it_begins_with_a_pose_from_standstill_and_not_before(
+    kinematic_artefact: Path, car: CarParameters
+) -> None:
+    made, x = estimator(NativeStep(kinematic_artefact, car, SETTINGS)), np.array([0.5, 0.2, 1.0])
+    gyro = Measurement(TS, GYRO, (5,), (0.0,), (0.02,))
+    assert not made.advance(TS, np.zeros(2), VARIANCE, [gyro])
+    with pytest.raises(InputError, match="estimator"):
+        made.read()
+    for k in range(1, 100):
+        assert made.advance(TS * (k + 1), np.zeros(2), VARIANCE, [of_pose(TS * (k + 1), x)])
+    found = made.read()
+    assert found.x[:3] == pytest.approx(x, abs=1e-4)
+    assert np.abs(found.x[3:6]).max() < 0.02
+    with pytest.raises(InputError, match="time"):
+        made.advance(0.5, np.zeros(2), VARIANCE, [])
+
+
+@pytest.mark.parametrize("changes", [{"gate": -1.0}, {"start": -START}, {"drift": DRIFT * np.nan}])
+def test_unusable_settings_are_refused(make: Make, changes: dict[str, float]) -> None:
+    settings = {"start": START, "drift": DRIFT, "gate": 1.0} | changes
+    with pytest.raises(InputError, match="estimator's settings"):
+        Estimator(make(), **settings)  # type: ignore[arg-type]
+
+
+def errors(
+    race: Racing, seed: int, every: int, late: int, noise: tuple[float, float]
+) -> tuple[Floats, Floats, Sequence[float]]:
+    """Of a lap of the true car, by a learned model: errors (n, 6), NEES (n,), NIS sums."""
+    step, random = race.controller().native, np.random.default_rng(seed)
+    made, x, u = estimator(step, gate=1.0), race.driven.x, race.driven.u
+    off: list[Floats] = []
+    nees: list[float] = []
+    for k in range(1, len(x)):
+        measured = []
+        if (then := k - late) >= 1 and then % every == 0:
+            measured = [noisy(random, of_pose(TS * then, x[then], *noise))]
+        known = np.r_[made.read().x[:7] if off else x[k - 1], u[k - 1]]
+        if not made.advance(TS * k, u[k - 1], step.variance(known), measured):
+            continue
+        found = made.read()
+        error = found.x[:6] - x[k, :6]
+        error[2] = np.remainder(error[2] + np.pi, 2 * np.pi) - np.pi
+        off.append(error)
+        nees.append(float(error @ np.linalg.solve(found.covariance[:6, :6], error)))
+    counts = made.instrument(POSE)
+    assert counts.refused <= 0.01 * counts.used
+    return np.array(off), np.array(nees), (counts.squared, counts.expected)
+
+
+@pytest.mark.parametrize(
+    ("every", "late", "noise"),
+    [(1, 1, (0.5, 0.2)), (1, 1, (1.0, 0.5)), (2, 2, (0.5, 0.2)), (2, 1, (1.0, 0.5))],
+)
+def test_its_covariance_is_that_of_its_errors_on_a_learned_car(
+    every: int, late: int, noise: tuple[float, float]
+) -> None:
+    """Normalised errors and innovations squared, over three seeds (Bar-Shalom et al., 5.4.2)."""
+    race = racing()
+    found = [errors(race, seed, every, late, noise) for seed in range(3)]
+    nees = np.mean([one[1][50:].mean() for one in found]) / 6
+    squared, expected = np.sum([one[2] for one in found], axis=0)
+    rmse = np.sqrt(np.mean([(one[0][50:, 3:] ** 2).mean(axis=0) for one in found], axis=0))
+    assert 0.7 < nees < 1.3
+    assert 0.8 < squared / expected < 1.2
+    assert (rmse < (0.006, 0.01, 0.08)).all()
