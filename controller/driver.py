@@ -6,9 +6,12 @@ say otherwise, so lockstep and free-running mode are the same here.
 """
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum, StrEnum
 
+from bayesrace.arrays import Floats
+from bayesrace.controller.estimator import Measurement, fill
 from bayesrace.controller.interface import Controller, Environment, StepOutput
 from bayesrace.controller.process_settings import ControllerSettings
 from bayesrace.messages import SENSOR_FAULTS, BrakingPlan, State
@@ -188,14 +191,29 @@ class Driver:
             return None
         return self._refused if self._library.br_cycle_forget(self._cycle) else None
 
-    def observe(self, state: State) -> bool:
-        """Takes a state that has arrived; False if it is not to be driven on."""
+    def estimate(self, start: Floats, drift: Floats, gate: float) -> None:
+        """From now on, states may come with measurements alone; (nx + 2,), see br_estimation.
+
+        InputError for unusable numbers, or a controller without the compiled model.
+        """
+        artefact, settings = self.controller.artefact, {"start": list(start), "drift": list(drift)}
+        estimation = artefact.ffi.new("br_estimation *", settings | {"gate": gate})
+        error = self._library.br_cycle_set_estimation(self._cycle, estimation)
+        artefact.check(error, "estimation")
+
+    def observe(self, state: State, measurements: Sequence[Measurement] | None = None) -> bool:
+        """Takes a state that has arrived; False if it is not to be driven on.
+
+        ``measurements``: of which it is to be estimated, whatever it says itself.
+        """
         measured, delays_s = self._measured, state.actuation_delays[2::3]
         measured.epoch, measured.run, measured.seq = state.epoch, state.run, state.seq
         measured.time_s, measured.lockstep = state.time_s, state.lockstep
         measured.x, measured.u_applied = state.x, state.u_applied
         measured.delays = len(delays_s)
         measured.delays_s[0 : len(delays_s)] = delays_s
+        measured.estimated = measurements is not None
+        measured.measurements = fill(measured.measured, measurements or ())
         library = self._library
         reception = library.br_cycle_observe(self._cycle, measured)
         if reception != library.BR_STATE_FOREIGN:

@@ -24,6 +24,15 @@ class Measurement(NamedTuple):
     """Standard deviations, in the unit of each value."""
 
 
+def fill(rows: Any, measured: Sequence[Measurement]) -> int:
+    """Writes measurements into rows of C, of which there are as many; their number."""
+    for row, one in zip(rows, measured, strict=False):
+        row.time_s, row.instrument, row.count = one.time_s, one.instrument, len(one.of)
+        for i, values in enumerate(zip(one.of, one.value, one.deviation, strict=True)):
+            row.of[i], row.value[i], row.deviation[i] = values
+    return len(measured)
+
+
 class Belief(NamedTuple):
     """State and offsets of sensors, with their covariance."""
 
@@ -62,10 +71,7 @@ class Estimator:
         time before the last one.
         """
         given = self._ffi.new("br_measurement[]", len(measured))
-        for one, row in zip(given, measured, strict=True):
-            one.time_s, one.instrument, one.count = row.time_s, row.instrument, len(row.of)
-            for i, values in enumerate(zip(row.of, row.value, row.deviation, strict=True)):
-                one.of[i], one.value[i], one.deviation[i] = values
+        fill(given, measured)
         numbers = (
             self._ffi.from_buffer("double[]", np.ascontiguousarray(one, dtype=np.float64))
             for one in (u, variance)

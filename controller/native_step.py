@@ -311,16 +311,25 @@ class NativeProblem:
     def _elapsed(self, elapsed_s: float | None) -> float:
         return self.manifest.step_s if elapsed_s is None else elapsed_s
 
-    def observe(self, x: Floats, u: Floats, duration_s: float, x_next: Floats) -> None:
+    def observe(
+        self,
+        x: Floats,
+        u: Floats,
+        duration_s: float,
+        x_next: Floats,
+        noise: Floats | None = None,
+    ) -> None:
         """What the car did between two measured states (nx,), under u (nu,) on average.
 
         Where such errors are larger than the posterior's standard deviations, caution widens these.
+        ``noise`` (nx,): variances of what an estimate differs by where the model is right.
         InputError for a duration that is not above 0 and at most 1, or numbers
         that are not finite.
         """
         given = self._given("x", x, self._nx), self._given("u", u, self._nu)
         after = self._given("x_next", x_next, self._nx)
-        error = self._library.br_mpc_observe(self.handle, *given, duration_s, after)
+        variances = self._ffi.NULL if noise is None else self._given("noise", noise, self._nx)
+        error = self._library.br_mpc_observe(self.handle, *given, duration_s, after, variances)
         self._check(error, "observe")
 
     def prepare(self, elapsed_s: float | None = None, budget_s: float = 0.0) -> None:

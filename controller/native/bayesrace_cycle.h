@@ -28,6 +28,7 @@ extern "C" {
 
 #define BR_DELAYS 64        /* most measured delays that come with one state */
 #define BR_BRAKING_ROWS 192 /* most rows of a braking plan */
+#define BR_MEASUREMENTS 16  /* most measurements that come with one state */
 
 /* Why a cycle has no result of a step: its status. The statuses of steps are smaller numbers. */
 typedef enum {
@@ -95,6 +96,9 @@ typedef struct {
     int delays;                 /* how many delays follow */
     double delays_s[BR_DELAYS]; /* from the decision on an input to its acting, since the last
                                  * state */
+    int estimated;              /* 1: x is not known, and estimated of what has been measured: */
+    int measurements;           /* how many follow */
+    br_measurement measured[BR_MEASUREMENTS]; /* since the last state, or before, late */
 } br_measured;
 
 /* Settings of the control cycle. */
@@ -215,12 +219,21 @@ BR_API br_mpc_error br_cycle_set_driving(br_cycle *cycle, const br_driving *sett
  * controller; NULL for none. */
 BR_API br_mpc_error br_cycle_set_clock(br_cycle *cycle, br_mpc_clock clock, void *context);
 
-/* A state has arrived. One that contradicts those before it (br_state.c) counts with what the
- * model predicts in place of what it says; after settings.stale_s the car brakes along the line, by
- * that prediction, and drives on once states agree with it again. A run is one stream of states:
- * one plant (epoch), one run number, rising numbers. Another stream is followed once the run has
- * ended (br_cycle_end), once nothing has come for long (br_cycle_forget), or once it has sent
- * several states in a row while the former one was silent: no single message locks out the plant.
+/* How states are estimated that are not measured as a whole, by the compiled controller's model.
+ * BR_ERROR_NOT_READY for another controller; BR_ERROR_PARAMETERS as for br_estimator_set. What it
+ * knows is read by br_estimator_read. */
+BR_API br_mpc_error br_cycle_set_estimation(br_cycle *cycle, const br_estimation *settings);
+BR_API const br_estimator *br_cycle_estimator(const br_cycle *cycle);
+
+/* A state has arrived. One that is to be estimated counts with what the estimator makes of it, and
+ * is doubted (BR_FAULT_POSITION) while its position is not known to the car's bound; the car is not
+ * driven before it has begun. A measured one that contradicts those before it (br_state.c) counts
+ * with what the model predicts in place of what it says; after settings.stale_s the car brakes
+ * along the line, by that prediction, and drives on once states agree with it again. A run is one
+ * stream of states: one plant (epoch), one run number, rising numbers. Another stream is followed
+ * once the run has ended (br_cycle_end), once nothing has come for long (br_cycle_forget), or once
+ * it has sent several states in a row while the former one was silent: no single message locks out
+ * the plant.
  */
 BR_API br_reception br_cycle_observe(br_cycle *cycle, const br_measured *state);
 

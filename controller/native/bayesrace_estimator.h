@@ -51,6 +51,8 @@ typedef struct {
     double time_s;
     double x[BR_NB];
     double covariance[BR_NB * BR_NB];
+    double corrected[BR_NX]; /* variances of what the period's measurements made of the prediction
+                              * from the period before: for br_mpc_observe */
 } br_belief;
 
 /* What has become of one instrument's measurements. */

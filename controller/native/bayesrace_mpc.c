@@ -122,7 +122,8 @@ void br_mpc_reset(br_mpc *mpc) {
 }
 
 br_mpc_error br_mpc_observe(br_mpc *mpc, const double x[BR_NX], const double u[BR_NU],
-                            double duration_s, const double x_next[BR_NX]) {
+                            double duration_s, const double x_next[BR_NX],
+                            const double noise[BR_NX]) {
     if (!mpc || !x || !u || !x_next) return BR_ERROR_NULL;
     if (!(duration_s > 0 && duration_s <= BR_PREDICT_MAX_S)) return BR_ERROR_TIME;
     if (!br_plausible_state(x) || !br_plausible_state(x_next) ||
@@ -133,6 +134,7 @@ br_mpc_error br_mpc_observe(br_mpc *mpc, const double x[BR_NX], const double u[B
     memcpy(newest->x, x, sizeof newest->x);
     memcpy(newest->u, u, sizeof newest->u);
     memcpy(newest->x_next, x_next, sizeof newest->x_next);
+    for (int i = 0; i < BR_NX; ++i) newest->noise[i] = noise ? noise[i] : 0;
     mpc->watch.newest = *newest;
     return BR_OK;
 }

@@ -274,11 +274,14 @@ BR_API br_mpc_error br_mpc_solve(br_mpc *mpc, const double x[BR_NX], const doubl
  * caution widens them from the step after the next on (info->widening), until br_mpc_reset or other
  * weights. For consecutive states of a car that moves, about a stage apart, by the thread that
  * steps; the newest before a step counts. Never needed; without caution it changes nothing.
+ * noise: variances of what x_next differs by from the prediction where the model is right, as an
+ * estimator has them; NULL: the states are exact.
  * BR_ERROR_TIME for a duration that is not above 0 and at most BR_PREDICT_MAX_S, BR_ERROR_STATE as
  * for br_mpc_predict.
  */
 BR_API br_mpc_error br_mpc_observe(br_mpc *mpc, const double x[BR_NX], const double u[BR_NU],
-                                   double duration_s, const double x_next[BR_NX]);
+                                   double duration_s, const double x_next[BR_NX],
+                                   const double noise[BR_NX]);
 
 /* The preparation phase of the next step, between two steps: shifts the plan for the elapsed_s
  * that is expected, linearises there, and does what of the QP depends neither on the next state nor

@@ -21,6 +21,9 @@ struct br_cycle {
     void *context;
     br_stream stream;
     br_monitor monitor;
+    br_estimator estimator;
+    double variance[BR_NE];    /* of the residual in the newest state, if that is known: */
+    int has_variance, unknown; /* unknown: nothing has been estimated yet */
     br_shown shown;
     br_delay delay;
     br_fallback fallback;
@@ -107,8 +110,10 @@ br_mpc_error br_cycle_drive_mpc(void *memory, size_t size, br_mpc *mpc, int hold
     };
     if (!mpc) return BR_ERROR_NULL;
     const br_mpc_error error = br_cycle_init(memory, size, &compiled, hold, out);
-    if (!error) (*out)->mpc = mpc;
-    return error;
+    if (error) return error;
+    (*out)->mpc = mpc;
+    br_estimator *estimator;
+    return br_estimator_init(&(*out)->estimator, sizeof(br_estimator), mpc, &estimator);
 }
 
 /* --- settings and counters --- */
@@ -139,6 +144,15 @@ br_mpc_error br_cycle_set_driving(br_cycle *cycle, const br_driving *s) {
     return BR_OK;
 }
 
+br_mpc_error br_cycle_set_estimation(br_cycle *cycle, const br_estimation *settings) {
+    if (!cycle) return BR_ERROR_NULL;
+    return cycle->mpc ? br_estimator_set(&cycle->estimator, settings) : BR_ERROR_NOT_READY;
+}
+
+const br_estimator *br_cycle_estimator(const br_cycle *cycle) {
+    return cycle ? &cycle->estimator : NULL;
+}
+
 br_mpc_error br_cycle_set_clock(br_cycle *cycle, br_mpc_clock clock, void *context) {
     if (!cycle) return BR_ERROR_NULL;
     cycle->clock = clock;
@@ -163,6 +177,40 @@ static void believe(br_cycle *cycle, double interval_s) {
     counters->faults[counters->fault] += counters->fault != BR_FAULT_NONE;
 }
 
+/* The residual's variance where the car is, for the next estimate. */
+static void foresee(br_cycle *cycle) {
+    if (cycle->has_variance || cycle->unknown) return;
+    double v[BR_NV];
+    memcpy(v, cycle->stream.newest.x, BR_NX * sizeof(double));
+    memcpy(v + BR_NX, cycle->decision.u, BR_NU * sizeof(double));
+    cycle->has_variance = br_mpc_variance(cycle->mpc, v, cycle->variance) == BR_OK;
+}
+
+/* What counts of the newest state where it is estimated; its variances by the one before. */
+static const double *estimate(br_cycle *cycle, const br_measured *before) {
+    br_measured *newest = &cycle->stream.newest;
+    static const double none[BR_NX] = {0};
+    const double bound_m = BR_MONITOR_POSITION_M * fmax(cycle->settings.sensor_tolerance, 1);
+    memcpy(newest->x, cycle->unknown ? none : before->x, sizeof newest->x);
+    foresee(cycle);
+    br_estimator *estimator = &cycle->estimator;
+    const br_mpc_error error = br_estimator_advance(estimator, newest->time_s, newest->u_applied,
+                                                    cycle->has_variance ? cycle->variance : NULL,
+                                                    newest->measured, newest->measurements);
+    cycle->unknown = error != BR_OK;
+    cycle->has_variance = 0;
+    cycle->counters.fault = BR_FAULT_NONE;
+    if (error) return NULL;
+    const br_estimate *now = &br_estimator_event(estimator, estimator->count - 1)->after;
+    memcpy(newest->x, now->x, sizeof newest->x);
+    const double spread = now->p[BR_INDEX_X][BR_INDEX_X] + now->p[BR_INDEX_Y][BR_INDEX_Y];
+    if (spread > bound_m * bound_m) cycle->counters.fault = BR_FAULT_POSITION;
+    cycle->counters.faults[cycle->counters.fault] += cycle->counters.fault != BR_FAULT_NONE;
+    if (!cycle->counters.fault) cycle->monitor.trusted_s = newest->time_s;
+    cycle->monitor.measured_s = newest->time_s;
+    return estimator->corrected;
+}
+
 br_reception br_cycle_observe(br_cycle *cycle, const br_measured *state) {
     if (!cycle || !state) return BR_STATE_FOREIGN;
     if (!isfinite(state->time_s)) {
@@ -184,13 +232,22 @@ br_reception br_cycle_observe(br_cycle *cycle, const br_measured *state) {
         cycle->stepped = cycle->stopping = cycle->reckoned = 0;
         cycle->shown.duration_s = 0;
         br_monitor_restart(&cycle->monitor);
+        br_estimator_reset(&cycle->estimator);
+        cycle->has_variance = 0;
+        cycle->unknown = state->estimated;
     }
     const br_fault doubted = cycle->counters.fault;
-    believe(cycle, interval_s);
-    if (doubted || cycle->counters.fault)
+    const int unknown = cycle->unknown;
+    const double *noise = NULL;
+    if (state->estimated)
+        noise = estimate(cycle, &before);
+    else
+        believe(cycle, interval_s);
+    if (doubted || unknown || cycle->unknown || cycle->counters.fault)
         cycle->shown.duration_s = 0;
     else if (!begins)
-        br_shown_observe(&cycle->shown, cycle->mpc, &cycle->settings, &before, state);
+        br_shown_observe(&cycle->shown, cycle->mpc, &cycle->settings, &before,
+                         &cycle->stream.newest, noise);
     br_delay_observe(&cycle->delay, &cycle->settings, state, &cycle->counters.delay_s);
     return BR_STATE_NEW;
 }
@@ -389,7 +446,10 @@ br_mpc_error br_cycle_decide(br_cycle *cycle, const br_environment *environment,
     const double acting_s = cycle->acting_s = decided_at_s + decision->delay_s;
     br_environment around = {.speed_limit_mps = INFINITY};
     if (environment) around = *environment;
-    if (cycle->halted && !slowing(cycle, decided_at_s, &around))
+    if (cycle->unknown) {
+        halt(cycle, acting_s);
+        decision->status = BR_NO_STATE;
+    } else if (cycle->halted && !slowing(cycle, decided_at_s, &around))
         halt(cycle, acting_s);
     else
         drive(cycle, &around, acting_s, budget_s, spent_s);
@@ -413,8 +473,9 @@ br_mpc_error br_cycle_brake(const br_cycle *cycle, br_braking *braking) {
 
 /* A car is being driven: a step has been made, and no halt since. */
 void br_cycle_prepare(br_cycle *cycle, double period_s, double budget_s) {
-    if (cycle && cycle->stepped)
-        cycle->controller.prepare(cycle->controller.self, period_s, budget_s);
+    if (!cycle || !cycle->stepped) return;
+    cycle->controller.prepare(cycle->controller.self, period_s, budget_s);
+    if (cycle->stream.newest.estimated) foresee(cycle);
 }
 
 void br_cycle_rehearse(br_cycle *cycle) {

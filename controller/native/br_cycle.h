@@ -3,6 +3,7 @@
 #define BR_CYCLE_H
 
 #include "bayesrace_cycle.h"
+#include "br_estimator.h"
 
 #define STAGE_ROUNDING 1e-6 /* share of a stage: times that are added up differ by so much */
 
@@ -22,11 +23,14 @@ int br_stream_forget(br_stream *stream, br_counters *counters);
 
 typedef struct {
     double duration_s, x[BR_NX], u[BR_NU]; /* since a measured state; 0: nothing yet; mean input */
+    double noise[BR_NX];                   /* see br_mpc_observe */
 } br_shown;
 
-/* mpc NULL: another controller, which is shown nothing. */
+/* mpc NULL: another controller, which is shown nothing. noise: of the state given the one before;
+ * NULL: it is exact. */
 void br_shown_observe(br_shown *shown, br_mpc *mpc, const br_driving *settings,
-                      const br_measured *before, const br_measured *state);
+                      const br_measured *before, const br_measured *state,
+                      const double noise[BR_NX]);
 
 /* --- br_state.c: the state at the moment from which the new input will act --- */
 

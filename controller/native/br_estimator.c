@@ -6,7 +6,7 @@
  * (Bar-Shalom, Li, Kirubarajan, "Estimation with Applications to Tracking and Navigation", section
  * 5.2.3 for the filter, 5.4 for the gate).
  */
-#include "bayesrace_estimator.h"
+#include "br_estimator.h"
 
 #include <math.h>
 #include <stdint.h>
@@ -19,27 +19,6 @@
 /* Chi-squared that one of 1,000 exceeds, by degrees of freedom from 1 on. */
 static const double EXCEEDED[] = {10.828, 13.816, 16.266, 18.467, 20.515, 22.458, 24.322};
 _Static_assert(sizeof EXCEEDED / sizeof EXCEEDED[0] >= BR_NX, "a bound for each number of values");
-
-typedef struct {
-    double x[BR_NB], p[BR_NB][BR_NB];
-} belief;
-
-typedef struct {
-    double time_s, u[BR_NU], variance[BR_NE]; /* u acted since the event before */
-    br_measurement measured;                  /* count 0: the end of a period */
-    int judged;                               /* it is in the counts of its instrument */
-    belief after;
-} event;
-
-struct br_estimator {
-    const br_mpc *mpc;
-    br_estimation settings;
-    int has_settings;
-    int count; /* of events, the oldest first; 0: it has not begun */
-    int order[BR_EVENTS];
-    event events[BR_EVENTS];
-    br_instrument instrument[BR_INSTRUMENTS];
-};
 
 size_t br_estimator_memory_size(void) { return sizeof(br_estimator); }
 
@@ -72,13 +51,11 @@ void br_estimator_reset(br_estimator *estimator) {
     if (estimator) estimator->count = 0;
 }
 
-static event *at(br_estimator *estimator, int k) { return &estimator->events[estimator->order[k]]; }
-
 /* --- between two events --- */
 
 /* x and P after a duration of at most a stage, under u. */
-static br_mpc_error propagate(const br_estimator *estimator, const event *by, double duration,
-                              belief *b) {
+static br_mpc_error propagate(const br_estimator *estimator, const br_event *by, double duration,
+                              br_estimate *b) {
     double f[BR_NX * BR_NX], q[BR_NX * BR_NX], fp[BR_NX][BR_NB];
     const br_mpc_error error =
         br_mpc_propagate(estimator->mpc, b->x, by->u, duration, by->variance, b->x, f, q);
@@ -103,8 +80,8 @@ static br_mpc_error propagate(const br_estimator *estimator, const event *by, do
     return BR_OK;
 }
 
-static br_mpc_error reach(const br_estimator *estimator, const event *by, double duration,
-                          belief *b) {
+static br_mpc_error reach(const br_estimator *estimator, const br_event *by, double duration,
+                          br_estimate *b) {
     br_mpc_error error = BR_OK;
     for (; duration > BR_TS + SAME_S && !error; duration -= BR_TS)
         error = propagate(estimator, by, BR_TS, b);
@@ -150,7 +127,7 @@ static void solve(int n, double s[BR_NX][BR_NX], double v[BR_NX]) {
 }
 
 /* P <- (I - K H) P (I - K H)' + K R K' */
-static void update(const br_measurement *m, double k[BR_NB][BR_NX], belief *b) {
+static void update(const br_measurement *m, double k[BR_NB][BR_NX], br_estimate *b) {
     double left[BR_NB][BR_NB];
     for (int i = 0; i < BR_NB; ++i)
         for (int j = 0; j < BR_NB; ++j) {
@@ -169,7 +146,7 @@ static void update(const br_measurement *m, double k[BR_NB][BR_NX], belief *b) {
 
 /* What the measurement says beyond what is believed; its squared distance by the covariance of
  * that. -1: refused, and nothing changes. */
-static double take(const br_estimation *settings, const br_measurement *m, belief *b) {
+static double take(const br_estimation *settings, const br_measurement *m, br_estimate *b) {
     const int n = m->count;
     double s[BR_NX][BR_NX], k[BR_NB][BR_NX], difference[BR_NX], weighted[BR_NX], squared = 0;
     for (int a = 0; a < n; ++a) {
@@ -213,7 +190,7 @@ static int valid(const br_measurement *m) {
 }
 
 /* Puts an event before the k-th; the oldest one makes room. Returns where it is now. */
-static int insert(br_estimator *estimator, int k, const event *given) {
+static int insert(br_estimator *estimator, int k, const br_event *given) {
     if (estimator->count == BR_EVENTS) {
         const int oldest = estimator->order[0];
         memmove(estimator->order, estimator->order + 1, (BR_EVENTS - 1) * sizeof(int));
@@ -244,8 +221,8 @@ static const br_measurement *first_pose(const br_measurement *measurements, int 
 }
 
 static void begin(br_estimator *estimator, const br_measurement *m) {
-    event first = {.time_s = m->time_s};
-    belief *b = &first.after;
+    br_event first = {.time_s = m->time_s};
+    br_estimate *b = &first.after;
     for (int i = 0; i < BR_NB; ++i)
         b->p[i][i] = estimator->settings.start[i] * estimator->settings.start[i];
     for (int a = 0; a < m->count; ++a) {
@@ -266,20 +243,21 @@ static void begin(br_estimator *estimator, const br_measurement *m) {
 static int place(br_estimator *estimator, const br_measurement *m) {
     const int last = estimator->count - 1;
     if (!valid(m)) return -1;
-    if (m->time_s > at(estimator, last)->time_s + SAME_S ||
-        m->time_s < at(estimator, 0)->time_s - SAME_S)
+    if (m->time_s > br_estimator_event(estimator, last)->time_s + SAME_S ||
+        m->time_s < br_estimator_event(estimator, 0)->time_s - SAME_S)
         return -1;
     int k = last;
-    while (k > 1 && at(estimator, k - 1)->time_s > m->time_s) --k;
-    if (k == 0) return -1;           /* nothing has been since the first */
-    event given = *at(estimator, k); /* the input is that of its period */
-    given.time_s = fmin(fmax(m->time_s, at(estimator, k - 1)->time_s), given.time_s);
+    while (k > 1 && br_estimator_event(estimator, k - 1)->time_s > m->time_s) --k;
+    if (k == 0) return -1;                              /* nothing has been since the first */
+    br_event given = *br_estimator_event(estimator, k); /* the input is that of its period */
+    given.time_s =
+        fmin(fmax(m->time_s, br_estimator_event(estimator, k - 1)->time_s), given.time_s);
     given.measured = *m;
     return insert(estimator, k, &given);
 }
 
 /* A measurement has been taken, or refused. */
-static void count(br_estimator *estimator, event *one, double squared) {
+static void count(br_estimator *estimator, br_event *one, double squared) {
     br_instrument *instrument = &estimator->instrument[one->measured.instrument];
     if (one->judged) return;
     one->judged = 1;
@@ -297,8 +275,8 @@ static void count(br_estimator *estimator, event *one, double squared) {
 /* Everything from the k-th event on is done over. */
 static br_mpc_error redo(br_estimator *estimator, int k) {
     for (; k < estimator->count; ++k) {
-        event *one = at(estimator, k);
-        const event *before = at(estimator, k - 1);
+        br_event *one = br_estimator_event(estimator, k);
+        const br_event *before = br_estimator_event(estimator, k - 1);
         one->after = before->after;
         const br_mpc_error error = reach(estimator, one, one->time_s - before->time_s, &one->after);
         if (error) return error;
@@ -306,6 +284,23 @@ static br_mpc_error redo(br_estimator *estimator, int k) {
         count(estimator, one, take(&estimator->settings, &one->measured, &one->after));
     }
     return BR_OK;
+}
+
+/* Puts the measurements where they belong; the first event that is to be done over. */
+static int place_all(br_estimator *estimator, const br_measurement *measurements, int count,
+                     const br_measurement *begun_with) {
+    int from = estimator->count - 1;
+    for (const br_measurement *m = measurements; m < measurements + count; ++m) {
+        if (m == begun_with) continue;
+        const int size = estimator->count, k = place(estimator, m), number = m->instrument;
+        if (k >= 0) {
+            from -= estimator->count == size; /* the oldest has made room */
+            from = k < from ? k : from;
+        } else if (number >= 0 && number < BR_INSTRUMENTS) {
+            estimator->instrument[number].lost += 1;
+        }
+    }
+    return from > 1 ? from : 1;
 }
 
 br_mpc_error br_estimator_advance(br_estimator *estimator, double time_s, const double u[BR_NU],
@@ -320,33 +315,34 @@ br_mpc_error br_estimator_advance(br_estimator *estimator, double time_s, const 
         if (!first) return BR_ERROR_NOT_READY;
         begin(estimator, first);
     }
-    if (time_s < at(estimator, estimator->count - 1)->time_s - SAME_S) return BR_ERROR_TIME;
-    event end = {.time_s = time_s};
+    const br_event *newest = br_estimator_event(estimator, estimator->count - 1);
+    const double duration = time_s - newest->time_s;
+    if (duration < -SAME_S) return BR_ERROR_TIME;
+    br_event end = {.time_s = time_s, .after = newest->after};
     memcpy(end.u, u, sizeof end.u);
     if (variance) memcpy(end.variance, variance, sizeof end.variance);
-    int from = insert(estimator, estimator->count, &end);
-    for (const br_measurement *m = measurements; m < measurements + count; ++m) {
-        if (m == first) continue;
-        const int size = estimator->count, k = place(estimator, m), number = m->instrument;
-        if (k >= 0) {
-            from -= estimator->count == size; /* the oldest has made room */
-            from = k < from ? k : from;
-        } else if (number >= 0 && number < BR_INSTRUMENTS) {
-            estimator->instrument[number].lost += 1;
-        }
+    br_estimate predicted = newest->after;
+    br_mpc_error error = reach(estimator, &end, duration, &predicted);
+    insert(estimator, estimator->count, &end);
+    if (!error) error = redo(estimator, place_all(estimator, measurements, count, first));
+    if (error) {
+        br_estimator_reset(estimator);
+        return error;
     }
-    const br_mpc_error error = redo(estimator, from > 1 ? from : 1);
-    if (error) br_estimator_reset(estimator);
-    return error;
+    newest = br_estimator_event(estimator, estimator->count - 1);
+    for (int i = 0; i < BR_NX; ++i)
+        estimator->corrected[i] = fmax(predicted.p[i][i] - newest->after.p[i][i], 0);
+    return BR_OK;
 }
 
 br_mpc_error br_estimator_read(const br_estimator *estimator, br_belief *out) {
     if (!estimator || !out) return BR_ERROR_NULL;
     if (!estimator->count) return BR_ERROR_NOT_READY;
-    const event *last = &estimator->events[estimator->order[estimator->count - 1]];
+    const br_event *last = &estimator->events[estimator->order[estimator->count - 1]];
     out->time_s = last->time_s;
     memcpy(out->x, last->after.x, sizeof out->x);
     memcpy(out->covariance, last->after.p, sizeof out->covariance);
+    memcpy(out->corrected, estimator->corrected, sizeof out->corrected);
     return BR_OK;
 }
 

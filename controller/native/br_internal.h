@@ -110,6 +110,7 @@ typedef struct {
 typedef struct {
     double duration; /* 0: there is none */
     double x[BR_NX], u[BR_NU], x_next[BR_NX];
+    double noise[BR_NX]; /* variances of x_next, by what is estimated */
 } br_transition;
 
 /* What a residual learns from, and the errors on it: see br_watch.c. */

@@ -72,7 +72,8 @@ void br_innovation_judge(br_mpc *mpc, const double variance[BR_NE]) {
         const double share = fabs(mpc->stage[0].in_e[i][j]) * stages;
         if (!(share > 0 && variance[j] > 0)) continue; /* nothing is known of this output */
         const double error = fabs(due->x_next[i] - predicted[i]) / share;
-        const double sigmas = fmin(error / sqrt(variance[j]), LARGEST);
+        const double expected = fmax(variance[j], due->noise[i] / (share * share));
+        const double sigmas = fmin(error / sqrt(expected), LARGEST);
         misfit->recent[j] += fmin(stages / RECENT, 1) * (sigmas - misfit->recent[j]);
         misfit->held[j] = fmax(misfit->recent[j], misfit->held[j] * fmax(1 - stages / HELD, 0));
     }

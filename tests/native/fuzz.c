@@ -251,7 +251,7 @@ static void observe(controller *c, int count) {
     u[0] = number(0.3, 1), u[1] = number(0, 6);
     const double duration = number(BR_TS, 2 * BR_TS);
     for (int i = 0; i < count; ++i) {
-        const br_mpc_error error = br_mpc_observe(c[i].mpc, x, u, duration, after);
+        const br_mpc_error error = br_mpc_observe(c[i].mpc, x, u, duration, after, NULL);
         CHECK(error == BR_OK || error == BR_ERROR_TIME || error == BR_ERROR_STATE);
     }
 }

@@ -164,10 +164,10 @@ static void check_null(br_mpc *mpc, const double *table, int rows, double spacin
     CHECK(br_mpc_predict(mpc, NULL, u, 0, x) == BR_ERROR_NULL);
     CHECK(br_mpc_predict(mpc, x, NULL, 0, x) == BR_ERROR_NULL);
     CHECK(br_mpc_predict(mpc, x, u, 0, NULL) == BR_ERROR_NULL);
-    CHECK(br_mpc_observe(NULL, x, x, BR_TS, x) == BR_ERROR_NULL);
-    CHECK(br_mpc_observe(mpc, NULL, x, BR_TS, x) == BR_ERROR_NULL);
-    CHECK(br_mpc_observe(mpc, x, NULL, BR_TS, x) == BR_ERROR_NULL);
-    CHECK(br_mpc_observe(mpc, x, x, BR_TS, NULL) == BR_ERROR_NULL);
+    CHECK(br_mpc_observe(NULL, x, x, BR_TS, x, NULL) == BR_ERROR_NULL);
+    CHECK(br_mpc_observe(mpc, NULL, x, BR_TS, x, NULL) == BR_ERROR_NULL);
+    CHECK(br_mpc_observe(mpc, x, NULL, BR_TS, x, NULL) == BR_ERROR_NULL);
+    CHECK(br_mpc_observe(mpc, x, x, BR_TS, NULL, NULL) == BR_ERROR_NULL);
     CHECK(br_mpc_get_plan(NULL, plan_x, plan_u) == BR_ERROR_NULL);
     CHECK(br_mpc_get_reference(NULL, reference) == BR_ERROR_NULL);
     CHECK(br_mpc_evaluate(mpc, NULL, x, plan_x, jacobian, hessian) == BR_ERROR_NULL);
@@ -182,7 +182,7 @@ static void check_times(br_mpc *mpc) {
         CHECK(br_mpc_step(mpc, x, none, NULL, bad[i], 0, u, &status, NULL) == BR_ERROR_TIME);
         CHECK(br_mpc_prepare(mpc, bad[i], 0) == BR_ERROR_TIME);
         CHECK(br_mpc_predict(mpc, x, u, bad[i], x) == BR_ERROR_TIME);
-        CHECK(br_mpc_observe(mpc, x, u, bad[i], x) == BR_ERROR_TIME);
+        CHECK(br_mpc_observe(mpc, x, u, bad[i], x, NULL) == BR_ERROR_TIME);
     }
     CHECK(br_mpc_predict(mpc, x, u, 1.001 * BR_PREDICT_MAX_S, x) == BR_ERROR_TIME);
     CHECK(br_mpc_monotonic(NULL) > 0 && br_mpc_monotonic(NULL) >= br_mpc_monotonic(NULL) - 60);
