@@ -257,7 +257,7 @@ class Watch:
         self.used = self.newest = own
         """With which the session was opened, and with which the next one can be."""
         self._role, self._changed, self._each_time = role, changed, each_time
-        self._members, self._stamps = own.members, tuple[Any, ...]()
+        self._members, self._stamps, self._said = own.members, tuple[Any, ...](), ""
 
     def look(self) -> None:
         """Reads it again if a file has changed; the log says what cannot be used."""
@@ -272,8 +272,11 @@ class Watch:
                 self._members = now.members
                 self._changed(now.members)
             now.check(self._role)
-        except InputError as error:
-            _log.warning("%s; what was read before stays in use", error)
+        except (OSError, ValueError) as error:  # read again at the next look: it may pass
+            self._stamps = ()
+            if (text := str(error)) != self._said:
+                _log.warning("%s; what was read before stays in use", text)
+            self._said = text
             return
         self.newest = now
 

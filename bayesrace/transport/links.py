@@ -129,6 +129,8 @@ def _text(address: Any) -> str:
     if not isinstance(address, tuple):
         return str(address)
     host, port = address[:2]
+    if len(address) == 4 and address[3]:  # of one cable, as IPv6 has them
+        host += f"%{address[3]}"
     return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
 
 
