@@ -2,7 +2,7 @@
 
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeVar, get_type_hints
+from typing import Any, TypeVar, get_origin, get_type_hints
 
 import numpy as np
 
@@ -47,7 +47,8 @@ def blank(kind: type[M], /, **known: Any) -> M:
     """A message of this kind; fields that are not ``known`` are zero or empty."""
     kinds = get_type_hints(kind)
     names = set(kind.__struct_fields__) - set(known)
-    return kind(**known, **{name: kinds[name]() for name in names})
+    empty = {name: {} if get_origin(kinds[name]) is Mapping else kinds[name]() for name in names}
+    return kind(**known, **empty)
 
 
 def state(run: int, seq: int, x: Floats, u: Floats, **known: Any) -> State:

@@ -115,4 +115,4 @@ def lap(number: int, time_s: float | None, *, flying: bool = True, off_m: float 
 def controller_status(version: str) -> Status:
     """A heartbeat of a controller that drives with these weights."""
     named = {"source": "controller", "phase": "driving", "weights_version": version}
-    return blank(Status, **named, rate_hz=50.0, counters={})
+    return blank(Status, **named, rate_hz=50.0)

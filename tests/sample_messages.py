@@ -16,13 +16,13 @@ def state(seq: int = 0, **changes: Any) -> State:
 
 def status(**changes: Any) -> Status:
     """The status of a plant that waits for a run."""
-    values = {"source": "plant", "phase": "idle", "state_age_s": -1.0, "counters": {}, "seen": {}}
+    values = {"source": "plant", "phase": "idle", "state_age_s": -1.0}
     return blank(Status, **(values | changes))
 
 
 def event(seq: int = 0, **changes: Any) -> Event:
     """An event of a plant."""
-    values = {"source": "plant", "kind": "kind", "text": "text", "data": {}}
+    values = {"source": "plant", "kind": "kind", "text": "text"}
     return blank(Event, seq=seq, **(values | changes))
 
 
