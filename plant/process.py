@@ -100,7 +100,6 @@ class PlantProcess:
         """Until SIGINT or SIGTERM; ``renewed``: :meth:`.Sessions.renewed`, between runs."""
         while not self._stopping:
             if time.monotonic() > self._spare_s and (session := renewed()) is not None:
-                self._session = session
                 publishers = self._heartbeat, self._states, self._truths, self._events
                 for one in (*publishers, self._hold, self.inbox):
                     one.bind(session)

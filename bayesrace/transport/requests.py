@@ -206,7 +206,7 @@ class Request:
     @property
     def by(self) -> dict[str, Scalar]:
         """The sender, for the data of an event; nothing without certificates."""
-        return {"by": self.sender} if self.sender else {}
+        return {"by": sender} if (sender := self.sender) else {}
 
     def join(self, other: "Request", most: int) -> bool:
         """Let ``other`` have the same answer; False if ``most`` requests have it already."""
