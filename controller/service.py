@@ -50,8 +50,8 @@ class Service:
         self._heartbeat = Heartbeat(session, name, "controller")
         self.hold = HoldWatch(session, name)
         self._holds_lost = 0
-        self._let_go = False
-        """The car is stopped for want of its director."""
+        self._stopped = self._let_go = False
+        """The car is stopped on request; for want of its director."""
         self._text = "waiting for the plant"
         self._publishing = threading.Lock()
         self._weights_refused = 0
@@ -102,12 +102,17 @@ class Service:
             if self._let_go:
                 driver.go()
                 self._let_go, self._text = False, f"run {newest.run} has begun"
-        elif self.hold.missing and driver.phase in (Phase.DRIVING, Phase.FALLBACK):
+        elif self.hold.missing and self._drives:
             driver.stop()
             self._let_go = True
             self._holds_lost += 1
             self._text = f"stopped: {HOLD_MISSING}"
             self.announce("hold_lost", self._text, {})
+
+    @property
+    def _drives(self) -> bool:
+        """Also of a stop on request: the phase follows with the next cycle."""
+        return self._driver.phase in (Phase.DRIVING, Phase.FALLBACK) and not self._stopped
 
     def react(self, item: Item) -> None:
         """Serves an item that is no message."""
@@ -170,8 +175,8 @@ class Service:
         if command is None:
             request.reply(False, why_not)
             return
-        self._let_go = False
-        if command.command == "stop":
+        self._let_go, self._stopped = False, command.command == "stop"
+        if self._stopped:
             self._driver.stop()
             self._text = f"stopped on request: {command.text}"
         else:

@@ -136,7 +136,7 @@ class Controller:
         self.service = Service(
             MagicMock(), MagicMock(), "orca", 50.0, self.driver, dict, lambda: PRESENCE
         )
-        self._watched = Watched(clock)
+        self.clock, self._watched = clock, Watched(clock)
         self.service.hold = self._watched.watch
         self._seq = 0
 
@@ -207,3 +207,19 @@ def test_a_new_run_does_not_undo_what_a_person_has_stopped(
     if phase == "driving":
         controller.command("stop")
     assert controller.drive(2, 1.0, held=True) == ("stopped" if phase == "driving" else "ready")
+
+
+def test_who_stops_the_car_as_its_director_dies_has_stopped_it(
+    controlled: Callable[..., Controller],
+) -> None:
+    """Both in one cycle of the controller."""
+    controller = controlled()
+    assert controller.drive(1, 1.0, held=True) == "driving"
+    assert controller.drive(1, 0.48, held=False) == "driving"
+    controller.clock.now_s += 0.1
+    controller.command("stop")
+    controller.service.check_hold()
+    assert controller.drive(1, 0.1, held=False) == "stopped"
+    assert controller.drive(2, 1.0, held=True) == "stopped"
+    controller.command("go")
+    assert controller.drive(2, 0.2, held=True) == "driving"
