@@ -140,10 +140,10 @@ class ControllerProcess:
 
     def _renew(self, renewed: Callable[[], Any]) -> None:
         if (session := self._service.renew(renewed)) is not None:
-            for one in (self._actuations, self._telemetry, self._braking, self.inbox):
-                one.bind(session)
             if self._weights is not None:
                 self._weights.bind(session)
+            for one in (self._actuations, self._telemetry, self._braking, self.inbox):
+                one.bind(session)  # the inbox last: it announces the process
 
     # Waiting -----------------------------------------------------------------------------------
 

@@ -256,8 +256,10 @@ class Watch:
         """``changed`` is called with each newer list of members, ``each_time`` at each look."""
         self.used = self.newest = own
         """With which the session was opened, and with which the next one can be."""
+        self.members = own.members
+        """The newest list, of a folder whose certificate may not be usable."""
         self._role, self._changed, self._each_time = role, changed, each_time
-        self._members, self._stamps, self._said = own.members, tuple[Any, ...](), ""
+        self._stamps, self._said = tuple[Any, ...](), ""
 
     def look(self) -> None:
         """Reads it again if a file has changed; the log says what cannot be used."""
@@ -267,9 +269,9 @@ class Watch:
             return
         try:
             now = Credentials.read(self.used.folder)
-            now.members.check_newer(self._members.number, now.folder / MEMBERS)
-            if now.members != self._members:
-                self._members = now.members
+            now.members.check_newer(self.members.number, now.folder / MEMBERS)
+            if now.members != self.members:
+                self.members = now.members
                 self._changed(now.members)
             now.check(self._role)
         except (OSError, ValueError) as error:  # read again at the next look: it may pass

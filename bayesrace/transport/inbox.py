@@ -223,6 +223,7 @@ class Inbox:
             self._offer(Kind.GONE, source, None)
         with self._lock:
             self._nodes.clear()
+        self._seen = {}  # their links are others now
         self._declared = [declare() for declare in self._declarations]
 
     def _declare(self, declare: Callable[[], Any]) -> None:

@@ -238,6 +238,8 @@ class Sessions:
         """Opens it; ``waits``: for an endpoint to listen on."""
         opened = _opened(self._endpoints, self._role, peers_follow, waits)
         self.current, self._links = self._stack.enter_context(opened)
+        if self.watch is not None:
+            self._links.update(self.watch.members)  # which may have become newer meanwhile
 
     def close(self) -> None:
         """Closes it."""
