@@ -347,6 +347,7 @@ def test_weights_of_the_largest_size_arrive(pair: tuple[Any, Any]) -> None:
         request.reply(True, "", {"size": len(request.payload)})
 
     service = declare_service(one, WEIGHTS, "orca", on_request)
+    meet(*(Inbox(session, "orca") for session in pair))
     reply = send_weights(two, "orca", bytes(MAX_WEIGHTS_BYTES), timeout_s=10.0)
     service.undeclare()
     assert reply.data["size"] == MAX_WEIGHTS_BYTES
