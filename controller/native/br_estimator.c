@@ -127,12 +127,13 @@ static void solve(int n, double s[BR_NX][BR_NX], double v[BR_NX]) {
 }
 
 /* P <- (I - K H) P (I - K H)' + K R K' */
-static void update(const br_measurement *m, double k[BR_NB][BR_NX], br_estimate *b) {
+static void update(const br_measurement *m, double hp[BR_NX][BR_NB], double k[BR_NB][BR_NX],
+                   br_estimate *b) {
     double left[BR_NB][BR_NB];
     for (int i = 0; i < BR_NB; ++i)
         for (int j = 0; j < BR_NB; ++j) {
             left[i][j] = b->p[i][j];
-            for (int a = 0; a < m->count; ++a) left[i][j] -= k[i][a] * observed(b->p[j], m->of[a]);
+            for (int a = 0; a < m->count; ++a) left[i][j] -= k[i][a] * hp[a][j];
         }
     for (int i = 0; i < BR_NB; ++i)
         for (int j = i; j < BR_NB; ++j) {
@@ -148,29 +149,31 @@ static void update(const br_measurement *m, double k[BR_NB][BR_NX], br_estimate 
  * that. -1: refused, and nothing changes. */
 static double take(const br_estimation *settings, const br_measurement *m, br_estimate *b) {
     const int n = m->count;
-    double s[BR_NX][BR_NX], k[BR_NB][BR_NX], difference[BR_NX], weighted[BR_NX], squared = 0;
+    double hp[BR_NX][BR_NB], s[BR_NX][BR_NX], k[BR_NB][BR_NX];
+    double difference[BR_NX], weighted[BR_NX], squared = 0;
     for (int a = 0; a < n; ++a) {
         difference[a] = m->value[a] - observed(b->x, m->of[a]);
         if (m->of[a] == BR_INDEX_PSI) difference[a] = remainder(difference[a], 2 * M_PI);
         weighted[a] = difference[a];
-        for (int i = 0; i < BR_NB; ++i) k[i][a] = observed(b->p[i], m->of[a]);
+        for (int i = 0; i < BR_NB; ++i) hp[a][i] = observed(b->p[i], m->of[a]);
     }
-    for (int a = 0; a < n; ++a)
-        for (int c = 0; c < n; ++c) {
-            const int offset = offset_in(m->of[a]);
-            s[a][c] = k[m->of[a]][c] + (offset < 0 ? 0 : k[offset][c]);
-            if (a == c) s[a][c] += m->deviation[a] * m->deviation[a];
-        }
+    for (int a = 0; a < n; ++a) {
+        for (int c = 0; c < n; ++c) s[a][c] = observed(hp[a], m->of[c]);
+        s[a][a] += m->deviation[a] * m->deviation[a];
+    }
     if (!factorise(n, s)) return -1;
     solve(n, s, weighted);
     for (int a = 0; a < n; ++a) squared += difference[a] * weighted[a];
     if (!(squared >= 0) || (settings->gate > 0 && squared > settings->gate * EXCEEDED[n - 1]))
         return -1;
     for (int i = 0; i < BR_NB; ++i) {
-        for (int a = 0; a < n; ++a) b->x[i] += k[i][a] * weighted[a];
+        for (int a = 0; a < n; ++a) {
+            b->x[i] += hp[a][i] * weighted[a];
+            k[i][a] = hp[a][i];
+        }
         solve(n, s, k[i]); /* P H' S^-1 */
     }
-    update(m, k, b);
+    update(m, hp, k, b);
     return squared;
 }
 
