@@ -155,7 +155,7 @@ def kept(path: Path, make: Callable[[Path], None], read: Callable[[Path], Result
     with locked(path):
         with suppress(InputError):  # made by another process, meanwhile
             return read_found()
-        # Nobody else can open it for writing while its mode is that of the umask.
+        # No other user can open it for writing while its mode is that of the umask.
         with replacing(path) as partial, temporary_folder(str(path.parent)) as own:
             made = own / partial.name
             make(made)

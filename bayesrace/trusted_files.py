@@ -30,7 +30,7 @@ def trusted(path: Path, *, make: bool = False) -> Path:
     be exchanged by its owner alone. OSError if there is none; with ``make`` a folder is made.
     """
     real = Path(os.path.realpath(path, strict=not make))
-    for one in (*reversed(real.parents), real):  # nobody can exchange what is below those checked
+    for one in (*reversed(real.parents), real):  # what is below those checked cannot be exchanged
         if make:
             make_folder(one)
         _check(one, one.lstat())

@@ -50,7 +50,7 @@ class RefusedError(InputError):
 
 def apart(plant: Status, controller: Status) -> str:
     """Why a run would not be one of these two, with the remedy; empty if each sees the other, and
-    nobody else of its kind."""
+    no other process of that kind."""
     pair, blind = ((plant, controller), (controller, plant)), []
     for one, other in pair:
         if strangers := [end for node, end in one.seen.items() if node != other.node]:

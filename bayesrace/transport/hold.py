@@ -22,7 +22,7 @@ class HoldWatch:
     """When the director of the current run was heard last; the transport's thread notes that.
 
     What counts is when the director sent, by the shortest way so far: a link that holds up each
-    message longer than the one before must not keep a car driving that nobody holds any more.
+    message longer than the one before must not keep a car driving whose director has gone.
     """
 
     def __init__(self, session: Any, car: str) -> None:

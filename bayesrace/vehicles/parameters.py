@@ -3,7 +3,7 @@
 What a driver can measure (geometry, mass, motor, one friction number) and what only system
 identification gives (tyre curves, yaw inertia) live in one object but are used by different models:
 the e-kinematic model and the racing line read the former only, the dynamic model reads all. A car
-that nobody simulates needs no more than the former.
+that is not simulated needs no more than the former.
 
 A car is a TOML file. Its sections are those of :data:`SECTIONS`, besides ``[tyres]`` and
 ``[drive]``, whose ``model`` says which values they hold (:mod:`.parts`), and ``[tuning.*]``, which
@@ -71,7 +71,7 @@ ACTUATORS: Final = ("d_min", "d_max", "delta_max_rad", "delta_rate_max_radps")
 _BRAKE_FADE_MPS: Final = 0.1
 """Of the reference car."""
 _UNKNOWN_BRAKING: Final = 0.5
-"""Share of the friction that a car on unknown tyres brakes with while nobody steers it."""
+"""Share of the friction that a car on unknown tyres brakes with while its steering is held."""
 
 
 def _scales(known: Mapping[str, Any]) -> Scales:
@@ -99,7 +99,7 @@ class CarParameters(Part):
     lr_m: float = Field(gt=0, description="centre of gravity to rear axle [m]")
     mass_kg: float = Field(gt=0, description="mass [kg]")
     inertia_kgm2: float | None = Field(
-        None, gt=0, description="yaw moment of inertia Iz, for who simulates the car [kg m^2]"
+        None, gt=0, description="yaw moment of inertia Iz, for simulations of the car [kg m^2]"
     )
     tyres: Tyres | None = Field(None, description="the tyres, by their model; likewise")
     drive: Drive = Field(description="the drive, by its model")

@@ -43,7 +43,7 @@ def build(
 def _replace(source: str, target: str) -> None:
     """Copies beside the target and renames: a running controller keeps the library it loaded."""
     beside = f"{target}.new"
-    Path(beside).touch(0o600)  # nobody else can open it for writing before it has its mode
+    Path(beside).touch(0o600)  # no other user can open it for writing meanwhile
     shutil.copy2(source, beside)
     Path(beside).replace(target)
 
