@@ -3,11 +3,9 @@ attacked, a car whose director is missing stands, and stays so."""
 
 import math
 import signal
-import socket
-import threading
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -27,7 +25,7 @@ from tests.network.observer import STANDING_MPS, Journey
 from tests.network.proxy import Proxy
 from tests.programs import run, until
 from tests.security.authority import CAR, Bundles, bundles, written
-from tests.security.rig import course, secured
+from tests.security.rig import attacking, course, secured
 
 __all__ = ["bundles", "course"]
 
@@ -218,24 +216,12 @@ def test_the_controller_stops_the_car_alone(
 
 @contextmanager
 def half_open(endpoints: tuple[str, str]) -> Iterator[None]:
-    """For the block, connections arrive at both that fail to greet, 30 a second each."""
-    over = threading.Event()
-
-    def attack() -> None:
-        for number in range(4000):
-            port = int(endpoints[number % 2].rpartition(":")[2])
-            with suppress(OSError), socket.create_connection(("127.0.0.1", port), 1.0) as one:
-                one.sendall(b"\x16\x03\x01")
-            if over.wait(1 / 60):
-                return
-
-    thread = threading.Thread(target=attack)
-    thread.start()
-    try:
+    """For the block, connections arrive at both that never greet, 30 a second each."""
+    with ExitStack() as stack:
+        for one in endpoints:
+            words = "127.0.0.1", one.rpartition(":")[2], 30, "silence", "127.0.0.1"
+            stack.enter_context(attacking("half_open", "opening", *words))
         yield
-    finally:
-        over.set()
-        thread.join()
 
 
 def test_no_new_link_is_needed(tmp_path: Path, course: Course, bundles: Bundles) -> None:
