@@ -24,6 +24,7 @@ from bayesrace.messages import ACTUATION, EVENT, STATE, TELEMETRY
 from bayesrace.recorder import Recorder
 from bayesrace.transport import Endpoints, Inbox, open_session
 from tests.car_fmu import packed_car
+from tests.programs import until
 from tests.pursuit_rig import CONTROLLER, PATIENCE_S, PLANT, Rig, running_rig, start
 
 # Drives well, with a plan, for a second; then raises, then gives no number.
@@ -209,13 +210,22 @@ def test_a_run_is_stopped_on_request_and_another_refused_meanwhile(rig: Rig) -> 
 def test_a_run_of_two_controllers_is_refused_or_no_success(rig: Rig) -> None:
     """Only the plant is connected to both: each would drive now and then."""
 
+    def plant_sees(controllers: int) -> None:
+        """The declaration travels, and so does its end."""
+        until(
+            lambda: len(rig.director.status("plant").seen) == controllers,
+            f"the plant sees {controllers}",
+            PATIENCE_S,
+        )
+
     @contextlib.contextmanager
     def another() -> Iterator[None]:
         with open_session(Endpoints(connect=(rig.at_plant,), low_latency=True)) as session:
             kept = Inbox(session, "orca")
             kept.announce("controller")
-            time.sleep(0.3)  # the declaration travels
+            plant_sees(2)
             yield
+        plant_sees(1)
 
     with another(), pytest.raises(InputError, match="2 controllers drive car 'orca'; end all but"):
         rig.start()
