@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from bayesrace.log import LogReader
 from bayesrace.messages import Message, Topic
 
-__all__ = ["Columns", "LogColumns", "columns_of"]
+__all__ = ["Columns", "LogColumns", "columns_of", "with_estimates"]
 
 Columns = NDArray[Any]
 """A structured array: a name gives a column; a mask or a slice gives rows with all columns."""
@@ -36,6 +36,32 @@ def columns_of(kind: type[Message], messages: Iterable[Message], names: str) -> 
     """The columns of messages of one kind that are in memory."""
     form = _Form(kind, names)
     return np.array([form.row(one) for one in messages], form.dtype)
+
+
+def with_estimates(states: Columns, cycles: Columns) -> Columns:
+    """``states`` with ``x`` as the controller has estimated it where ``estimated``; those of which
+    it has not are left out.
+
+    ``states`` has run, seq, x and estimated, or is of the truth and stays as it is; ``cycles`` has
+    run, state_seq and estimate.
+    """
+    if "estimated" not in (states.dtype.names or ()) or not states["estimated"].any():
+        return states
+    found = {
+        (run, seq): estimate[:7]
+        for run, seq, estimate in cycles[["run", "state_seq", "estimate"]].tolist()
+        if estimate
+    }
+    whole = ~states["estimated"]
+    keys = states[["run", "seq"]].tolist()
+    kept = np.array([known or key in found for known, key in zip(whole, keys, strict=True)], bool)
+    filled: Columns = states[kept]
+    for row, key in zip(
+        filled, (key for key, one in zip(keys, kept, strict=True) if one), strict=True
+    ):
+        if row["estimated"]:
+            row["x"] = found[key]
+    return filled
 
 
 class LogColumns:

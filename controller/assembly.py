@@ -119,6 +119,7 @@ class PredictiveController:
 
     last_error = ""
     """The cycle knows it."""
+    nominal = None
 
     @property
     def artefact(self) -> Artefact:

@@ -119,6 +119,7 @@ class Cycle:
         timing.ticks += 1
         timing.received_ns = received_ns
         output = self.driver.output or _NO_OUTPUT
+        estimate, deviation = self._estimate()
         numbers = {"cost": output.cost, "cost_shifted": output.cost_shifted, **output.numbers}
         return Telemetry(
             seq=seq,
@@ -142,8 +143,20 @@ class Cycle:
             tube_m=_finite(output.tube_m),
             sensor_fault=SENSOR_FAULTS[decision.fault],
             second_start=output.second_start,
+            estimate=estimate,
+            deviation=deviation,
             **{name: _known(numbers.get(name, none), none) for name, none in NOT_REPORTED.items()},
         )
+
+    def _estimate(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        """Of an estimated state, and its standard deviations; nothing of another."""
+        belief = self.driver.belief
+        if belief is None:
+            return (), ()
+        deviation = np.sqrt(np.maximum(belief.covariance.diagonal(), 0.0))
+        clipped = (one.clip(-_LARGEST, _LARGEST).tolist() for one in (belief.x, deviation))
+        estimate, deviations = map(tuple, clipped)
+        return estimate, deviations
 
 
 def _finite(plan: Floats) -> tuple[float, ...]:

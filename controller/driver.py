@@ -9,12 +9,12 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum, StrEnum
+from typing import Final
 
-from bayesrace.arrays import Floats
-from bayesrace.controller.estimator import Measurement, fill
+from bayesrace.controller.estimator import MOST_INSTRUMENTS, Belief, Measurement, fill, read
 from bayesrace.controller.interface import Controller, Environment, StepOutput
 from bayesrace.controller.process_settings import ControllerSettings
-from bayesrace.messages import SENSOR_FAULTS, BrakingPlan, State
+from bayesrace.messages import QUANTITIES, SENSOR_FAULTS, BrakingPlan, Reading, State
 from bayesrace.transport import Numbering
 from bayesrace.vehicles.parameters import CarParameters
 
@@ -55,6 +55,8 @@ class Phase(StrEnum):
 
 
 _PHASES, _LEVELS = tuple(Phase), tuple(Level)
+_INDEX: Final = {name: i for i, name in enumerate(QUANTITIES)}
+_VX: Final = _INDEX["vx"]
 
 
 @dataclass(slots=True)
@@ -104,6 +106,9 @@ class Driver:
         self._measured.averaged = 1
         self._decided, self._braking = ffi.new("br_decision *"), ffi.new("br_braking *")
         self._around, self._null = ffi.new("br_environment *"), ffi.NULL
+        self._believed, self._instruments = ffi.new("br_belief *"), dict[str, int]()
+        estimator = car.tuning.estimator
+        self.estimate(*estimator.settings(nominal=controller.nominal is not None))
         self._refused: State | None = None
         self.last_error = ""
         """Of the last step that was broken; empty if none was."""
@@ -111,8 +116,12 @@ class Driver:
         """Of the newest cycle."""
         self.newest: State | None = None
         """The newest state that counts."""
+        self.belief: Belief | None = None
+        """What the newest state is estimated to be; None: it is measured, or nothing is known."""
         self.numbering = Numbering()
         """States received and lost, foreign ones left out."""
+        self.readings_left_out = 0
+        """Readings of more instruments than the estimator has room for."""
 
     @property
     def phase(self) -> Phase:
@@ -191,29 +200,52 @@ class Driver:
             return None
         return self._refused if self._library.br_cycle_forget(self._cycle) else None
 
-    def estimate(self, start: Floats, drift: Floats, gate: float) -> None:
-        """From now on, states may come with measurements alone; (nx + 2,), see br_estimation.
-
-        InputError for unusable numbers, or a controller without the compiled model.
-        """
-        artefact, settings = self.controller.artefact, {"start": list(start), "drift": list(drift)}
-        estimation = artefact.ffi.new("br_estimation *", settings | {"gate": gate})
-        error = self._library.br_cycle_set_estimation(self._cycle, estimation)
+    def estimate(self, start: Sequence[float], drift: Sequence[float], gate: float) -> None:
+        """How states are estimated; (nx + 2,), see br_estimation. InputError for bad numbers."""
+        artefact, nominal = self.controller.artefact, self.controller.nominal
+        settings = {"start": list(start), "drift": list(drift), "gate": gate}
+        error = self._library.br_cycle_set_estimation(
+            self._cycle,
+            artefact.ffi.NULL if nominal is None else nominal.handle,
+            artefact.ffi.new("br_estimation *", settings),
+        )
         artefact.check(error, "estimation")
 
-    def observe(self, state: State, measurements: Sequence[Measurement] | None = None) -> bool:
-        """Takes a state that has arrived; False if it is not to be driven on.
+    def _measurement(self, reading: Reading) -> Measurement | None:
+        """None: of one instrument too many."""
+        number = self._instruments.setdefault(reading.instrument, len(self._instruments))
+        if number >= MOST_INSTRUMENTS:
+            del self._instruments[reading.instrument]
+            self.readings_left_out += 1
+            return None
+        values = reading.values
+        return Measurement(
+            reading.time_s,
+            number,
+            [_INDEX[name] for name in values],
+            [value for value, _ in values.values()],
+            [deviation for _, deviation in values.values()],
+        )
 
-        ``measurements``: of which it is to be estimated, whatever it says itself.
-        """
+    @property
+    def vx_mps(self) -> float:
+        """Speed in the newest state, measured or estimated; 0 where it is not known."""
+        if self.belief is not None:
+            return float(self.belief.x[_VX])
+        return 0.0 if self.newest is None or self.newest.estimated else self.newest.x[_VX]
+
+    def observe(self, state: State) -> bool:
+        """Takes a state that has arrived; False if it is not to be driven on."""
         measured, delays_s = self._measured, state.actuation_delays[2::3]
         measured.epoch, measured.run, measured.seq = state.epoch, state.run, state.seq
         measured.time_s, measured.lockstep = state.time_s, state.lockstep
         measured.x, measured.u_applied = state.x, state.u_applied
         measured.delays = len(delays_s)
         measured.delays_s[0 : len(delays_s)] = delays_s
-        measured.estimated = measurements is not None
-        measured.measurements = fill(measured.measured, measurements or ())
+        measured.estimated, measured.measurements = state.estimated, 0
+        if state.estimated:
+            known = [one for one in map(self._measurement, state.readings) if one is not None]
+            measured.measurements = fill(measured.measured, known)
         library = self._library
         reception = library.br_cycle_observe(self._cycle, measured)
         if reception != library.BR_STATE_FOREIGN:
@@ -223,7 +255,10 @@ class Driver:
         if reception != library.BR_STATE_NEW:
             self._refused = state
             return False
-        self.newest = state
+        self.newest, self.belief = state, None
+        if state.estimated:
+            estimator = library.br_cycle_estimator(self._cycle)
+            self.belief = read(self.controller.artefact, estimator, self._believed)
         return True
 
     def decide(

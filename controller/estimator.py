@@ -6,9 +6,13 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from bayesrace.arrays import Floats
-from bayesrace.controller.native_step import NativeProblem
+from bayesrace.controller.native_step import Artefact, NativeProblem
+from bayesrace.errors import InputError
 
-__all__ = ["Belief", "Estimator", "Measurement"]
+__all__ = ["MOST_INSTRUMENTS", "Belief", "Estimator", "Measurement", "fill", "read"]
+
+MOST_INSTRUMENTS: Final = 8
+"""BR_INSTRUMENTS in controller/native/bayesrace_estimator.h."""
 
 
 class Measurement(NamedTuple):
@@ -43,12 +47,23 @@ class Belief(NamedTuple):
     """(nx + 2, nx + 2)"""
 
 
+def read(artefact: Artefact, estimator: Any, found: Any) -> Belief | None:
+    """What a br_estimator knows at the end of the last period, by way of a br_belief; None:
+    nothing yet."""
+    if artefact.library.br_estimator_read(estimator, found):
+        return None
+    x = np.frombuffer(artefact.ffi.buffer(found.x), np.float64).copy()
+    covariance = np.frombuffer(artefact.ffi.buffer(found.covariance), np.float64).copy()
+    return Belief(found.time_s, x, covariance.reshape(len(x), len(x)))
+
+
 class Estimator:
     """An extended Kalman filter over the model and the weights of a step; for its thread."""
 
     def __init__(self, step: NativeProblem, start: Floats, drift: Floats, gate: float) -> None:
         """``start``, ``drift`` (nx + 2,), ``gate``: as in br_estimation; InputError if unusable."""
-        artefact, self._step = step.artefact, step  # whose memory has to stay
+        self._artefact = artefact = step.artefact
+        self._step = step  # its memory has to stay
         self._library, self._ffi, self._check = artefact.library, artefact.ffi, artefact.check
         size = self._library.br_estimator_memory_size()
         self._memory, handle = artefact.memory(size), self._ffi.new("br_estimator **")
@@ -86,11 +101,10 @@ class Estimator:
 
     def read(self) -> Belief:
         """At the end of the last period; InputError while nothing is known."""
-        self._check(self._library.br_estimator_read(self.handle, self._belief), "estimator")
-        found, number = self._belief, np.float64
-        x = np.frombuffer(self._ffi.buffer(found.x), number).copy()
-        covariance = np.frombuffer(self._ffi.buffer(found.covariance), number).copy()
-        return Belief(found.time_s, x, covariance.reshape(len(x), len(x)))
+        belief = read(self._artefact, self.handle, self._belief)
+        if belief is None:
+            raise InputError("estimator: no position and heading have been measured yet")
+        return belief
 
     def instrument(self, number: int) -> Any:
         """What has become of an instrument's measurements: a br_instrument."""

@@ -10,7 +10,7 @@ import numpy as np
 from bayesrace.arrays import Floats
 
 if TYPE_CHECKING:
-    from bayesrace.controller.native_step import Artefact
+    from bayesrace.controller.native_step import Artefact, NativeProblem
     from bayesrace.controller.weights.adoption import WeightsPort
 
 __all__ = ["NO_LIMITS", "NO_PLAN", "ControlLaw", "Controller", "Environment", "StepOutput"]
@@ -86,6 +86,11 @@ class Controller(Protocol):
     @property
     def track(self) -> str:
         """Identity of the track that it drives, as in :class:`bayesrace.messages.Status`."""
+
+    @property
+    def nominal(self) -> "NativeProblem | None":
+        """The model that states are estimated by where the compiled step drives nothing; None: that
+        of the step, with its correction and its variance."""
 
     @property
     def port(self) -> "WeightsPort | None":

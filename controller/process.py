@@ -176,7 +176,7 @@ class ControllerProcess:
     def _recorded(self, state: State, arrived_ns: int) -> State:
         self._service.report_fault()
         if self._adoption is not None and not self._driver.fault:
-            self._adoption.observe(state.x[3], self._driver.fallen_back)
+            self._adoption.observe(self._driver.vx_mps, self._driver.fallen_back)
         self._arrived_ns = self._service.arrived_ns = arrived_ns
         return state
 
@@ -209,7 +209,7 @@ class ControllerProcess:
             if state is not None:
                 if state.final or not state.lockstep:
                     break
-                self._cycle.answer(state, self._send_in_lockstep, self._limits(state))
+                self._cycle.answer(state, self._send_in_lockstep, self._limits())
             elif self._silent() or not self._service.plant_there:
                 break
             self._service.beat()
@@ -263,7 +263,7 @@ class ControllerProcess:
         # not the time since this state's own arrival.
         decided_at_s = max(schedule.plant_time_s(timing.released_ns), state.time_s)
         spent_s = (time.monotonic_ns() - schedule.release_ns) * 1e-9
-        limits = self._limits(state)
+        limits = self._limits()
         decision = self._cycle.decide(decided_at_s, budget_s, spent_s, limits)
         timing.overruns += time.monotonic_ns() > self._budget_end_ns
         self._send(state, decision)
@@ -388,9 +388,9 @@ class ControllerProcess:
         message = self._cycle.telemetry(self._telemetry.next_seq, state, decision, self._arrived_ns)
         self._telemetry.put(message, lockstep=state.lockstep)
 
-    def _limits(self, state: State) -> Environment | None:
+    def _limits(self) -> Environment | None:
         """What limits the car in this cycle."""
-        return None if self._adoption is None else self._adoption.limits(state.x[3])
+        return None if self._adoption is None else self._adoption.limits(self._driver.vx_mps)
 
     def _actuation(self, state: State, decision: Decision) -> Actuation:
         return self._cycle.actuation(self._actuations.next_seq, state, decision)
@@ -413,6 +413,7 @@ class ControllerProcess:
             "states_lost": driver.numbering.lost,
             "states_stale": driver.count("stale"),
             "states_foreign": driver.count("foreign"),
+            "readings_left_out": driver.readings_left_out,
             "refused": self._decoder.refused + self._service.hold.decoder.refused,
             "overflowed": self.inbox.overflowed,
             "requests_rejected": self.inbox.requests_rejected,

@@ -12,7 +12,7 @@ import numpy as np
 from bayesrace.arrays import Floats
 from bayesrace.controller.driver import DOUBTED, STEP_FAILED
 from bayesrace.controller.interface import ControlLaw, Environment, StepOutput
-from bayesrace.controller.native_step import Artefact
+from bayesrace.controller.native_step import NativeProblem
 
 __all__ = ["PythonController"]
 
@@ -28,7 +28,8 @@ class PythonController:
 
     def __init__(self, artefact: Path, law: ControlLaw) -> None:
         """``artefact``: any built for a car; its control cycle is used, its step is not."""
-        self.artefact = Artefact(artefact)
+        self.nominal = NativeProblem(artefact)
+        self.artefact = self.nominal.artefact
         self.law = law
         self.last_error = ""
         self._pending: BaseException | None = None

@@ -32,7 +32,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from bayesrace.arrays import AnyArray, Flags
-from bayesrace.columns import Columns, LogColumns
+from bayesrace.columns import Columns, LogColumns, with_estimates
 from bayesrace.errors import InputError, faults_in
 from bayesrace.integrators import PREDICTION, Discretisation
 from bayesrace.learning.dataset import (
@@ -46,15 +46,25 @@ from bayesrace.log import LogReader
 from bayesrace.messages import STATE, TELEMETRY, TRUTH, topic_of
 from bayesrace.vehicles import CarParameters, builtin_cars, car_text, described_car
 
-__all__ = ["CYCLES", "MAX_BYTES", "STATES", "LogFacts", "Samples", "dataset_from_columns"]
+__all__ = [
+    "CYCLES",
+    "MAX_BYTES",
+    "STATES",
+    "TRUE_STATES",
+    "LogFacts",
+    "Samples",
+    "dataset_from_columns",
+]
 __all__ += ["dataset_from_log", "dataset_from_npz", "log_facts", "read_samples", "write_npz"]
 
 T = TypeVar("T")
 
-STATES: Final = "seq run time_s x u_applied"
-"""Columns of the states that samples are made of ..."""
-CYCLES: Final = "run state_seq fallback sensor_fault"
-"""... and of the telemetry, which says what is left out of them."""
+TRUE_STATES: Final = "seq run time_s x u_applied"
+"""Columns of the true states that samples can be made of, ..."""
+STATES: Final = f"{TRUE_STATES} estimated"
+"""... of those that a controller sees ..."""
+CYCLES: Final = "run state_seq fallback sensor_fault estimate"
+"""... and of the telemetry, which says what is left out of them, and what was estimated."""
 
 _DOUBTFUL: Final = 16
 """States up to one that is not believed which may be wrong as well: the controller looks back as
@@ -127,8 +137,8 @@ def dataset_from_columns(
 ) -> Dataset:
     """Filtered samples from consecutive states of the same run (all runs, or those named).
 
-    ``states`` has the columns :data:`STATES`: the measured ones to learn from, the true ones to
-    judge by. ``cycles`` has the columns :data:`CYCLES`. Left out are the states in whose cycles the
+    ``states`` has the columns :data:`STATES` to learn from, or those of the true ones to judge by.
+    ``cycles`` has the columns :data:`CYCLES`. Left out are the states in whose cycles the
     fallback acted, and those that were not believed, with the states just before, which may be as
     wrong. The input of sample k is ``u_applied`` of the state after it, which acted, not the
     requested one. A missing state is counted as "gap". ``limits``: as of
@@ -136,6 +146,7 @@ def dataset_from_columns(
     """
     if runs is not None:
         states = states[np.isin(states["run"], list(runs))]
+    states = with_estimates(states, cycles)
     now, after = states[:-1], states[1:]
     passed_s = after["time_s"] - now["time_s"]
     # A fault of the plant repeats the last state: no time has passed.
@@ -185,8 +196,8 @@ def dataset_from_log(
     ``name``: the car's name in the network, if it differs from its own. ``truth``: the true states
     in place of the measured ones. InputError if it is no log or holds no driving of this car.
     """
-    topic = TRUTH if truth else STATE
-    log = LogColumns(Path(path), {topic: STATES, TELEMETRY: CYCLES}, name or car.name).read()
+    topic, names = (TRUTH, TRUE_STATES) if truth else (STATE, STATES)
+    log = LogColumns(Path(path), {topic: names, TELEMETRY: CYCLES}, name or car.name).read()
     try:
         return dataset_from_columns(log[topic], log[TELEMETRY], car, step_s, runs, limits=limits)
     except InputError as error:

@@ -80,6 +80,8 @@ class Driven(Trajectory):
     """Of the fallback, shape (m,); see :class:`bayesrace.controller.driver.Level`."""
     faults: NDArray[np.int64]
     """What speaks against each state, shape (m,); see :attr:`.fault`."""
+    estimates: list[tuple[float, ...]]
+    """What was made of the readings (9,), one for each of these states; empty where x counts."""
     step_us: Floats
     """Execution times of the steps that were made, shape (at most m,)."""
     second_starts: int
@@ -134,6 +136,8 @@ class Driven(Trajectory):
         cycles = np.empty(len(answered), [(name, object) for name in CYCLES.split()])
         cycles["run"], cycles["state_seq"] = answered["run"], answered["seq"]
         cycles["fallback"] = self.levels[: len(answered)]
+        for i, one in enumerate(self.estimates[: len(answered)]):
+            cycles["estimate"][i] = one  # as one value, not as a row of an array
         cycles["sensor_fault"] = [SENSOR_FAULTS[one] for one in self.faults[: len(answered)]]
         return dataset_from_columns(self.moments, cycles, self.car, self.step_s)
 
@@ -210,6 +214,7 @@ class ClosedLoop:
         self._states: list[State] = []
         self._true_x: list[tuple[float, ...]] = []
         self._decided: list[tuple[int, int, int]] = []
+        self._estimates: list[tuple[float, ...]] = []
         self._step_us: list[float] = []
         second_starts = self._cycle.driver.count("second_starts")
         if self._log is not None:
@@ -236,6 +241,7 @@ class ClosedLoop:
             decided[:, 0],
             decided[:, 1],
             decided[:, 2],
+            self._estimates,
             np.array(self._step_us),
             self._cycle.driver.count("second_starts") - second_starts,
             end,
@@ -261,6 +267,8 @@ class ClosedLoop:
     def _send(self, state: State, decision: Decision) -> None:
         self._answer = decision.d, decision.delta_rate
         self._decided.append((decision.status, int(decision.level), decision.fault))
+        belief = self._cycle.driver.belief
+        self._estimates.append(() if belief is None else tuple(belief.x.tolist()))
         if decision.stepped:
             self._step_us.append(decision.step_us)
         if self._log is not None:

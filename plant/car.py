@@ -156,6 +156,8 @@ class CarRun:
             lockstep=request.lockstep,
             actuation_delays=actuation_delays or self._delays,
             final=final,
+            estimated=False,
+            readings=(),
         )
         return state, x
 

@@ -72,7 +72,14 @@ class Loop:
         if seen:
             self._write(
                 "state",
-                State(**car, lockstep=self.lockstep, actuation_delays=delays, final=False),
+                State(
+                    **car,
+                    lockstep=self.lockstep,
+                    actuation_delays=delays,
+                    final=False,
+                    estimated=False,
+                    readings=(),
+                ),
                 seq,
             )
             self._write("truth", Truth(**car), seq)

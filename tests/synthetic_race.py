@@ -129,6 +129,8 @@ class _Log:
                 "lockstep": drive.lockstep,
                 "actuation_delays": (),
                 "final": final,
+                "estimated": False,
+                "readings": (),
             }
             self.put("state", State(**sample, x=tuple(seen), **rest))
             if self._truth:

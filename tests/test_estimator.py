@@ -16,7 +16,7 @@ from bayesrace.errors import InputError
 from bayesrace.gp.expression import mean_function
 from bayesrace.gp.weights import GpWeights
 from bayesrace.integrators import PREDICTION
-from bayesrace.messages import State
+from bayesrace.messages import Reading, State
 from bayesrace.operation.closed_loop import ClosedLoop
 from bayesrace.vehicles import CarParameters
 from bayesrace.vehicles.models import e_kinematic
@@ -300,9 +300,8 @@ class Seen(ClosedLoop):
         super().__init__(race.car, race.track, race.line, race.controller(), settings=settings)
         self._pose, self._random = noise, np.random.default_rng(seed)
         driver = self._cycle.driver
-        driver.estimate(START, DRIFT, gate=1.0)
         self._observe = driver.observe
-        driver.observe = self._see  # type: ignore[method-assign, assignment]
+        driver.observe = self._see  # type: ignore[method-assign]
 
     def _see(self, state: State) -> bool:
         random, then, measured = self._random, len(self._true_x) - 2, []
@@ -312,7 +311,19 @@ class Seen(ClosedLoop):
             if random.random() < 0.01:
                 off = random.normal(0, 0.3, 3)
                 measured = [measured[0]._replace(value=tuple(measured[0].value + off))]
-        return self._observe(structs.replace(state, x=(0.0,) * 7), measured)
+        readings = tuple(
+            Reading(
+                instrument="pose",
+                time_s=one.time_s,
+                values=dict(
+                    zip(("x", "y", "psi"), zip(one.value, one.deviation, strict=True), strict=True)
+                ),
+            )
+            for one in measured
+        )
+        return self._observe(
+            structs.replace(state, x=(0.0,) * 7, estimated=True, readings=readings)
+        )
 
 
 @pytest.mark.parametrize("noise", [(0.5, 0.2), (1.0, 0.5)])

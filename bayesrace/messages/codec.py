@@ -162,10 +162,14 @@ def decode_json(kind: type[M], data: bytes) -> M:
 def json_schema(kind: type[Message]) -> dict[str, Any]:
     """JSON schema of a class of messages, in the subset that viewers such as Foxglove read:
     every value has one type, every object its properties."""
-    schema: dict[str, Any] = msgspec.json.schema(kind)["$defs"][kind.__name__]
+    known = msgspec.json.schema(kind)["$defs"]
+    schema: dict[str, Any] = known[kind.__name__]
     schema["description"] = schema["description"].split("\n")[0]
     properties = schema["properties"]
     properties["schema"] = {"type": "integer", "const": schema_version(kind)}
+    for one in properties.values():  # viewers read no references
+        if reference := one.get("items", {}).get("$ref"):
+            one["items"] = known[reference.rpartition("/")[2]]
     for field, names, rows in _named(kind):
         number, most = properties[field]["items"], properties[field]["maxItems"] // len(names)
         column = {"type": "array", "items": number, "maxItems": most}

@@ -14,9 +14,10 @@ from typing import Annotated, Final
 from msgspec import Meta, Struct
 
 __all__ = [
-    "BRAKING_ROWS", "END_REASONS", "NOT_REPORTED", "PHASES", "SENSOR_FAULTS", "Actuation",
-    "BrakingPlan", "CarSample", "Command", "Event", "Hold", "Message", "Reply", "RollbackRequest",
-    "RunRequest", "Scalar", "State", "Status", "StatusRequest", "StopRequest", "Telemetry", "Truth",
+    "BRAKING_ROWS", "END_REASONS", "ESTIMATED", "NOT_REPORTED", "PHASES", "QUANTITIES",
+    "SENSOR_FAULTS", "Actuation", "BrakingPlan", "CarSample", "Command", "Event", "Hold", "Message",
+    "Reading", "Reply", "RollbackRequest", "RunRequest", "Scalar", "State", "Status",
+    "StatusRequest", "StopRequest", "Telemetry", "Truth",
 ]  # fmt: skip
 
 END_REASONS: Final = (
@@ -84,10 +85,16 @@ DataMap = Annotated[
     Meta(max_length=200, extra_json_schema={"properties": {}}),
 ]
 
-_CAR_STATE: Final = ("x", "y", "psi", "vx", "vy", "omega", "delta")
+QUANTITIES: Final = ("x", "y", "psi", "vx", "vy", "omega", "delta")
+"""What can be measured of a car: its states."""
+
+ESTIMATED: Final = (*QUANTITIES, "gyro_offset", "steering_offset")
+"""What is estimated of a car: these, then the offsets of the measured yaw rate and steering angle
+[rad/s, rad]."""
+
 _INPUT: Final = ("d", "delta_rate")
 _DELAYS: Final = ("state_seq", "arrival_s", "acting_s")
-CarState = Annotated[tuple[Number, ...], _vector(*_CAR_STATE)]
+CarState = Annotated[tuple[Number, ...], _vector(*QUANTITIES)]
 Input = Annotated[tuple[Number, ...], _vector(*_INPUT)]
 
 
@@ -122,12 +129,43 @@ class CarSample(Message, frozen=True, kw_only=True):
     """Start-line crossings so far, forwards minus backwards."""
 
 
-class State(CarSample, frozen=True, kw_only=True, tag=2):
-    """Measured state of the car, on ``bayesrace/{car}/state``.
+_Quantity = Annotated[str, _one_of(QUANTITIES)]
+_Measured = tuple[Number, Annotated[float, Meta(ge=1e-12, le=1e6)]]
+_MEASURED: Final = {
+    "type": "array", "items": {"type": "number", "minimum": -1e6, "maximum": 1e6},
+    "minItems": 2, "maxItems": 2,
+}  # fmt: skip
+
+
+class Reading(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """What one instrument has measured at one moment."""
+
+    instrument: Annotated[str, Meta(max_length=40)]
+    """Its name."""
+    time_s: Annotated[float, Meta(ge=-1e9, le=1e9)]
+    """Plant time of the measurement, which may be reported late."""
+    values: Annotated[
+        Mapping[_Quantity, _Measured],
+        Meta(
+            min_length=1, max_length=len(QUANTITIES),
+            extra_json_schema={"properties": dict.fromkeys(QUANTITIES, _MEASURED)},
+        ),
+    ]  # fmt: skip
+    """By what it has measured: the value, which for a heading may be off by whole turns, and its
+    standard deviation; the errors are independent."""
+
+
+class State(CarSample, frozen=True, kw_only=True, tag=3):
+    """What is measured of the car, on ``bayesrace/{car}/state``.
 
     The only input of controller and learning.
     """
 
+    estimated: bool
+    """True: the state is to be estimated of ``readings``, and ``x`` says nothing; False: ``x`` is
+    measured, and the readings are nothing to drive by."""
+    readings: Annotated[tuple[Reading, ...], Meta(max_length=16)]
+    """What instruments have reported since the state before."""
     lockstep: bool
     """True if the plant waits for the actuation that answers this very message."""
     actuation_delays: Annotated[
@@ -171,7 +209,7 @@ class Actuation(Message, frozen=True, kw_only=True, tag=2):
     """Status code of the controller's step; 0: converged."""
 
 
-class Telemetry(Message, frozen=True, kw_only=True, tag=5):
+class Telemetry(Message, frozen=True, kw_only=True, tag=6):
     """Plan, residuals and timing of one control cycle, on ``bayesrace/{car}/telemetry``."""
 
     run: Count
@@ -203,7 +241,7 @@ class Telemetry(Message, frozen=True, kw_only=True, tag=5):
     delay_s: Delay
     """Delay from ``Actuation.decided_at_s`` to application, over which the state is predicted; 0
     without."""
-    plan_x: Annotated[tuple[Number, ...], _vector(*_CAR_STATE, rows=501)]
+    plan_x: Annotated[tuple[Number, ...], _vector(*QUANTITIES, rows=501)]
     """Predicted states row by row, N + 1 rows of 7, to 1e-6; empty without a prediction."""
     plan_u: Annotated[tuple[Number, ...], _vector(*_INPUT, rows=500)]
     """Planned inputs row by row, N rows of 2, to 1e-6."""
@@ -237,10 +275,17 @@ class Telemetry(Message, frozen=True, kw_only=True, tag=5):
     sensor_fault: Annotated[str, _one_of(SENSOR_FAULTS)]
     """What speaks against the measured state, in whose place the model's prediction counts; empty:
     nothing (:data:`SENSOR_FAULTS`)."""
+    estimate: Annotated[tuple[Number, ...], _vector(*ESTIMATED, rows=1)]
+    """What has been made of the readings, at the time of the state (:data:`ESTIMATED`); empty: the
+    state was measured as a whole, or nothing is known yet."""
+    deviation: Annotated[tuple[Number, ...], _vector(*ESTIMATED, rows=1)]
+    """Standard deviations of the estimate."""
 
     def __post_init__(self) -> None:
-        if len(self.plan_x) % len(_CAR_STATE) or len(self.plan_u) % len(_INPUT):
+        if len(self.plan_x) % len(QUANTITIES) or len(self.plan_u) % len(_INPUT):
             raise ValueError("plan_x, plan_u: not whole rows of 7, 2")
+        if len(self.estimate) % len(ESTIMATED) or len(self.deviation) % len(ESTIMATED):
+            raise ValueError(f"estimate, deviation: not {len(ESTIMATED)} numbers")
 
 
 NOT_REPORTED: Final[Mapping[str, float]] = {

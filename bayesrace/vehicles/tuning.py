@@ -168,6 +168,43 @@ class MonitorTuning(_Section):
         )
 
 
+class EstimatorTuning(_Section):
+    """Where a state is estimated of what instruments report (controller/native/br_estimator.c).
+
+    Standard deviations before anything has been measured, around 0, and random walks beyond what
+    the model with its weights says of its own uncertainty. Where the model is not corrected, as in
+    training drives, its errors are those of the tyres.
+    """
+
+    position_m: float = _number(1.0, "of a coordinate [m]")
+    heading_rad: float = _number(3.0, "of the heading [rad]")
+    speed_mps: float = _number(0.5, "of the speed [m/s]")
+    lateral_mps: float = _number(0.2, "of the lateral velocity [m/s]")
+    yaw_rate_radps: float = _number(1.0, "of the yaw rate [rad/s]")
+    steering_rad: float = _number(0.05, "of the steering angle [rad]")
+    gyro_offset_radps: float = _number(0.1, "of the gyro's offset [rad/s]", ge=0)
+    steering_offset_rad: float = _number(0.02, "of the measured steering angle's [rad]", ge=0)
+    drift_mps: float = _number(0.005, "walk of the velocities in a second [m/s]")
+    drift_radps: float = _number(0.05, "and of the yaw rate [rad/s]")
+    nominal_mps: float = _number(0.5, "walk of the velocities by the model without weights [m/s]")
+    nominal_radps: float = _number(5.0, "and of the yaw rate [rad/s]")
+    gate: float = _number(
+        1.0, "times the squared distance that one of 1,000 exceeds, a reading is refused [-]", ge=0
+    )
+
+    def settings(self, *, nominal: bool) -> tuple[tuple[float, ...], tuple[float, ...], float]:
+        """start, drift and gate of br_estimation; ``nominal``: of a model without weights."""
+        walk, turn = self.drift_mps, self.drift_radps
+        if nominal:
+            walk, turn = self.nominal_mps, self.nominal_radps
+        start = (
+            self.position_m, self.position_m, self.heading_rad, self.speed_mps, self.lateral_mps,
+            self.yaw_rate_radps, self.steering_rad, self.gyro_offset_radps,
+            self.steering_offset_rad,
+        )  # fmt: skip
+        return start, (0.0, 0.0, 0.0, walk, walk, turn, 0.0, 0.0, 0.0), self.gate
+
+
 class PlausibleTuning(_Section):
     """Largest magnitudes of a state that a controller accepts."""
 
@@ -312,6 +349,7 @@ class Tuning(_Section):
     turn: TurnTuning
     braking: BrakingTuning
     monitor: MonitorTuning
+    estimator: EstimatorTuning
     plausible: PlausibleTuning
     scale: ScaleTuning
     objective: ObjectiveTuning

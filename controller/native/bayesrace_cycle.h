@@ -219,10 +219,11 @@ BR_API br_mpc_error br_cycle_set_driving(br_cycle *cycle, const br_driving *sett
  * controller; NULL for none. */
 BR_API br_mpc_error br_cycle_set_clock(br_cycle *cycle, br_mpc_clock clock, void *context);
 
-/* How states are estimated that are not measured as a whole, by the compiled controller's model.
- * BR_ERROR_NOT_READY for another controller; BR_ERROR_PARAMETERS as for br_estimator_set. What it
- * knows is read by br_estimator_read. */
-BR_API br_mpc_error br_cycle_set_estimation(br_cycle *cycle, const br_estimation *settings);
+/* How states are estimated that are not measured as a whole, by this model, which must stay; NULL:
+ * that of the compiled controller, with its variance. BR_ERROR_NULL without any; else as for
+ * br_estimator_set. Begins anew. What it knows is read by br_estimator_read. */
+BR_API br_mpc_error br_cycle_set_estimation(br_cycle *cycle, const br_mpc *model,
+                                            const br_estimation *settings);
 BR_API const br_estimator *br_cycle_estimator(const br_cycle *cycle);
 
 /* A state has arrived. One that is to be estimated counts with what the estimator makes of it, and

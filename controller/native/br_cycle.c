@@ -112,8 +112,7 @@ br_mpc_error br_cycle_drive_mpc(void *memory, size_t size, br_mpc *mpc, int hold
     const br_mpc_error error = br_cycle_init(memory, size, &compiled, hold, out);
     if (error) return error;
     (*out)->mpc = mpc;
-    br_estimator *estimator;
-    return br_estimator_init(&(*out)->estimator, sizeof(br_estimator), mpc, &estimator);
+    return BR_OK;
 }
 
 /* --- settings and counters --- */
@@ -144,9 +143,13 @@ br_mpc_error br_cycle_set_driving(br_cycle *cycle, const br_driving *s) {
     return BR_OK;
 }
 
-br_mpc_error br_cycle_set_estimation(br_cycle *cycle, const br_estimation *settings) {
+br_mpc_error br_cycle_set_estimation(br_cycle *cycle, const br_mpc *model,
+                                     const br_estimation *settings) {
     if (!cycle) return BR_ERROR_NULL;
-    return cycle->mpc ? br_estimator_set(&cycle->estimator, settings) : BR_ERROR_NOT_READY;
+    br_estimator *estimator = &cycle->estimator;
+    const br_mpc_error error =
+        br_estimator_init(estimator, sizeof *estimator, model ? model : cycle->mpc, &estimator);
+    return error ? error : br_estimator_set(estimator, settings);
 }
 
 const br_estimator *br_cycle_estimator(const br_cycle *cycle) {
@@ -179,7 +182,7 @@ static void believe(br_cycle *cycle, double interval_s) {
 
 /* The residual's variance where the car is, for the next estimate. */
 static void foresee(br_cycle *cycle) {
-    if (cycle->has_variance || cycle->unknown) return;
+    if (cycle->has_variance || cycle->unknown || !cycle->mpc) return;
     double v[BR_NV];
     memcpy(v, cycle->stream.newest.x, BR_NX * sizeof(double));
     memcpy(v + BR_NX, cycle->decision.u, BR_NU * sizeof(double));

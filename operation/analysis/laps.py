@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesrace.arrays import Floats, Rows
-from bayesrace.columns import Columns, LogColumns
+from bayesrace.columns import Columns, LogColumns, with_estimates
 from bayesrace.controller.driver import Level
 from bayesrace.integrators import PLANT_SCHEME, PLANT_SUBSTEP_HZ, Discretisation
-from bayesrace.learning.sources import CYCLES, STATES
+from bayesrace.learning.sources import CYCLES, STATES, TRUE_STATES
 from bayesrace.messages import STATE, TELEMETRY, TRUTH, Topic
 from bayesrace.tracks import StartLine, Track
 from bayesrace.vehicles import CarParameters
@@ -257,10 +257,10 @@ def judge(
 
 def judge_log(log: Path, run: int, track: Track, asked: int) -> Verdict:
     """Judges a run in a log."""
-    wanted: dict[Topic[Any], str] = {STATE: STATES, TRUTH: STATES, TELEMETRY: CYCLES}
+    wanted: dict[Topic[Any], str] = {STATE: STATES, TRUTH: TRUE_STATES, TELEMETRY: CYCLES}
     columns = LogColumns(log, wanted).read()
     states, truth, telemetry = (columns[one][columns[one]["run"] == run] for one in wanted)
-    known = truth if len(truth) else states
+    known = truth if len(truth) else with_estimates(states, telemetry)
     projected = track.project_path(known["x"][:, :2])
     laps = time_laps(track, known["time_s"], known["x"][:, :2], projected.s_m)
     counted = laps.after[-1] if laps.after else len(known)

@@ -9,11 +9,11 @@ from typing import Annotated, Any, Final
 import numpy as np
 from pydantic import BaseModel, BeforeValidator, Field, ValidationError
 
-from bayesrace.columns import Columns, LogColumns
+from bayesrace.columns import Columns, LogColumns, with_estimates
 from bayesrace.errors import InputError, faults_in
 from bayesrace.files import read_text
 from bayesrace.integrators import PREDICTION, Discretisation
-from bayesrace.learning.sources import CYCLES, STATES
+from bayesrace.learning.sources import CYCLES, STATES, TRUE_STATES
 from bayesrace.messages import ACTUATION, EVENT, STATE, TELEMETRY, TRUTH, Topic
 from bayesrace.operation.analysis.laps import Trajectory
 from bayesrace.raceline import RaceLine, read_raceline
@@ -45,7 +45,7 @@ RUN_EVENT: Final = "run"
 
 RUN_COLUMNS: Final[Mapping[Topic[Any], str]] = {
     STATE: f"{STATES} source_time_ns lap lockstep",
-    TRUTH: f"{STATES} lap",
+    TRUTH: f"{TRUE_STATES} lap",
     ACTUATION: "seq run weights_version",
     TELEMETRY: f"seq {CYCLES} solve_us tube_m pace widening",
     EVENT: "run source kind text data",
@@ -281,7 +281,8 @@ def _planned(log: LogColumns) -> tuple[list[RunRecord], bool]:
     if any(len(run.truth) for run in runs):
         return runs, True
     columns = RUN_COLUMNS[TRUTH].split()
-    return [replace(run, truth=run.states[columns]) for run in runs], False
+    known = [with_estimates(run.states, run.telemetry)[columns] for run in runs]
+    return [replace(run, truth=one) for run, one in zip(runs, known, strict=True)], False
 
 
 def _read_settings(path: Path) -> RunSettings:

@@ -73,7 +73,7 @@ class Collector:
         self._ended: deque[Stretch] = deque()
         self._run, self._laps = (-1, -1), 0
         self._cycles: deque[Telemetry] = deque(maxlen=2 * MOST_STATES)
-        """Those in which the fallback drove, or the state was not believed."""
+        """Those in which the fallback drove, or the state was estimated or not believed."""
         self._waited_s, self._looked_s = 0.0, time.monotonic()
 
     def state(self, state: State) -> None:
@@ -98,7 +98,7 @@ class Collector:
         for one in (*self._ended, self._open):
             if one.states and one.states[0].run == message.run:
                 one.reported = max(one.reported, message.state_seq)
-        if message.fallback > 0 or message.sensor_fault:
+        if message.fallback > 0 or message.sensor_fault or message.estimate:
             self._cycles.append(message)
 
     def actuation(self, message: Actuation) -> None:
