@@ -101,8 +101,8 @@ lint: $(VENV)/.ready-dev
 
 # Of the files of all platforms, no host is named.
 hashes: $(VENV)/.ready-dev
-	$(BIN)/uv pip compile --quiet --no-config --no-deps --generate-hashes --no-annotate --python-version 3.11 \
-		--custom-compile-command 'make $@' --output-file constraints.hashed.txt constraints.txt
+	$(BIN)/uv pip compile --quiet --no-config --no-deps --generate-hashes --no-annotate --universal \
+		--python-version 3.11 --custom-compile-command 'make $@' --output-file constraints.hashed.txt constraints.txt
 
 # The list is of what users install with all extras, here in an environment of its own, checked by hashes.
 RELEASE := build/release

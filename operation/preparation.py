@@ -22,6 +22,7 @@ from bayesrace.integrators import Discretisation
 from bayesrace.learning.dataset import Dataset, concatenate
 from bayesrace.learning.settings import Progress, TrainingSettings
 from bayesrace.learning.sources import CYCLES, STATES, dataset_from_columns
+from bayesrace.manifest import opened_library, read_manifest
 from bayesrace.messages import STATE, TELEMETRY
 from bayesrace.operation.closed_loop import Driven
 from bayesrace.operation.collect import collect, drive_length_s, training_margin_m
@@ -138,6 +139,9 @@ def prepare(
     if artefact is None:  # what is missing is reported now, not after the training
         code_folder()
         find_compiler()
+    else:
+        with opened_library(artefact, read_manifest(artefact)):  # it is whole and may be loaded
+            pass
     car = settings.driven_car
     driven_on = [load_track(name, car.width_m) for name in tracks]
     prepared_tracks = []

@@ -176,14 +176,13 @@ class Run:
                 self.suspended(late_ns * 1e-9)
                 start_ns, begin_ns, late_ns = start_ns + late_ns, begin_ns + late_ns, 0
             self.counters.overruns += late_ns > period_ns
-            end = self._receive()
-            if end is not None:
-                return end
-            if self._lost_s is None and self.hold.missing:
+            asked = self._receive()
+            if asked is None and self._lost_s is None and self.hold.missing:
                 self._lost_s = self._car.time_s
                 self.counters.holds_lost += 1
             delays, end = self._drive_period(begin_ns, begin_ns + period_ns, seq)
-            end = end or self._finished()
+            # The controller learns from a final state that nobody holds this run any more.
+            end = end or self._finished() or asked
             if end is not None and end.reason == "left_world":
                 return end  # no message could carry this state
             seq += 1

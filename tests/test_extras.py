@@ -34,7 +34,17 @@ def pins(name: str) -> dict[str, str]:
 def test_the_hashes_are_of_the_constraints_and_name_no_host() -> None:
     assert pins("constraints.hashed.txt") == pins("constraints.txt"), "run 'make hashes'"
     text = re.sub("^#.*\n", "", (ROOT / "constraints.hashed.txt").read_text(), flags=re.MULTILINE)
-    assert re.fullmatch(r"([\w.-]+==[\w.+!-]+( \\\n    --hash=sha256:[0-9a-f]{64})+\n)+", text)
+    hashed = r"[\w.-]+==[\w.+!-]+( ; [^\\\n]+)?( \\\n    --hash=sha256:[0-9a-f]{64})+\n"
+    assert re.fullmatch(f"({hashed})+", text)
+
+
+def test_what_is_not_for_every_python_is_marked_so_in_every_list() -> None:
+    marked = [
+        set(re.findall(r"^[ \"]*([\w-]+)[=>][^;\n]*; ?python_", text, re.MULTILINE))
+        for name in ("pyproject.toml", "constraints.txt", "constraints.hashed.txt")
+        if (text := (ROOT / name).read_text())
+    ]
+    assert marked == [{"slipx"}] * 3
 
 
 @pytest.fixture(scope="module")

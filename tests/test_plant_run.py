@@ -54,6 +54,8 @@ class Controller:
                 "run": state.run, "state_seq": state.seq, "decided_at_s": state.time_s,
                 "u": (1.0, 0.0), "weights_version": "", "status": 0,
             }  # fmt: skip
+            if changes.pop("stop", False):
+                self.ask_again(Item(Kind.REQUEST, "stop", None, 0))
             if (plan := changes.pop("plan", None)) is not None:
                 self._items.append(Item(Kind.MESSAGE, "braking", plan, time.monotonic_ns()))
             actuation = Actuation(**(values | changes))
@@ -69,6 +71,13 @@ class Controller:
     def ask_again(self, request: Item) -> None:
         """As a client that sends the next request as soon as the last one is answered."""
         self._items.append(request)
+
+    def react(self, request: Item) -> End | None:
+        """As a plant that is asked to stop, and to say something again and again."""
+        if request.name == "stop":
+            return End("stopped", "stopped on request")
+        self.ask_again(request)
+        return None
 
     @contextlib.contextmanager
     def stamped(self) -> Iterator[None]:
@@ -124,7 +133,7 @@ def run_with(
         request=request, simulator=simulator, inbox=cast(Inbox, controller),
         states=cast(Publisher[State], controller),
         truths=cast(Publisher[Truth], controller), decoder=Decoder(Actuation), counters=counters,
-        numbering=Numbering(), react=controller.ask_again, beat=lambda: None, epoch=EPOCH,
+        numbering=Numbering(), react=controller.react, beat=lambda: None, epoch=EPOCH,
         suspended=suspensions.append, delay_s=delay_s, hold=cast(HoldWatch, hold),
     )  # fmt: skip
     end = run.execute()
@@ -256,3 +265,18 @@ def test_nothing_drives_a_car_whose_director_is_missing(planned: bool) -> None:
     assert max(taken[8:]) <= 0.0
     assert controller.states[-1].final
     assert abs(controller.states[-1].x[3]) < 0.02
+
+
+def test_a_run_that_is_stopped_says_so_in_a_final_state() -> None:
+    """Else its controller would miss the director of a run that nobody holds any more; and whoever
+    stops it is there, though late."""
+    hold = SimpleNamespace(missing=False)
+
+    def answer(state: State) -> list[dict[str, Any]]:
+        hold.missing = state.seq == 5
+        return [{"stop": hold.missing}]
+
+    controller = Controller(answer)
+    counters, _, end = run_with(controller, hold)
+    assert (end.reason, counters.holds_lost) == ("stopped", 0)
+    assert [one.final for one in controller.states[-2:]] == [False, True]

@@ -10,6 +10,7 @@ from rich.console import Console
 
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import GpWeights
+from bayesrace.manifest import LIBRARY
 from bayesrace.operation.preparation import Prepared, prepare
 from bayesrace.operation.settings import PreparationSettings
 from bayesrace.operation.terminal.terminal import stages_on
@@ -94,6 +95,16 @@ def test_a_cache_that_others_may_write_is_refused_before_all_else(
     with pytest.raises(InputError, match=r"cache is writable for other users.*chmod go-w"):
         preparing()
     assert len([*(tmp_path / "cache").iterdir()]) == 1  # the controller that was there
+
+
+def test_a_controller_that_others_may_write_is_refused_before_all_else(
+    kinematic_artefact: Path, tmp_path: Path
+) -> None:
+    artefact = tmp_path / "artefact"
+    shutil.copytree(kinematic_artefact, artefact)
+    (artefact / LIBRARY).chmod(0o666)
+    with pytest.raises(InputError, match=f"{LIBRARY} is writable for other users"):
+        prepare(SETTINGS, ("nowhere",), None, artefact=artefact)  # type: ignore[arg-type]
 
 
 def test_the_training_drive_is_kept_for_all_that_shapes_it(preparing: Preparing) -> None:

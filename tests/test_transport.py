@@ -370,6 +370,29 @@ def test_a_taken_port_is_an_error_that_says_what_to_do() -> None:
         pass
 
 
+def test_what_comes_late_over_a_closed_session_changes_nothing(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Such as the end of a process's token while the next session has it again."""
+    monkeypatch.setattr(inbox_module, "in_transport_thread", lambda handler: handler)
+    old, new = MagicMock(), MagicMock()
+    inbox = Inbox(old, "orca")
+    inbox.watch("plant")
+
+    def token(session: MagicMock, kind: zenoh.SampleKind) -> None:
+        handler = session.liveliness().declare_subscriber.call_args.args[1]
+        handler(SimpleNamespace(key_expr="bayesrace/orca/alive/plant/1", kind=kind))
+
+    token(old, zenoh.SampleKind.PUT)  # not taken from the queue before the next session is there
+    inbox.bind(new)
+    token(new, zenoh.SampleKind.PUT)
+    token(old, zenoh.SampleKind.DELETE)
+    assert inbox.nodes("plant") == {"1"}
+    items = [inbox.get() for _ in range(4)]
+    assert [one and one.kind for one in items] == [Kind.ALIVE, Kind.GONE, Kind.ALIVE, None]
+    assert inbox.alive == {"plant"}
+
+
 def test_a_link_made_with_the_last_descriptor_ends_no_process() -> None:
     """A flood of connections leaves none to look at the process's sockets with."""
     before = resource.getrlimit(resource.RLIMIT_NOFILE)

@@ -6,6 +6,7 @@ import shutil
 import signal
 import socket
 import subprocess
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -16,12 +17,12 @@ from unittest.mock import Mock
 
 import pytest
 
-from bayesrace.errors import TransientError
+from bayesrace.errors import RestartError, TransientError
 from bayesrace.messages import Role
 from bayesrace.operation import certificates
 from bayesrace.operation.certificates import add, init
 from bayesrace.operation.cli import processes
-from bayesrace.transport import Endpoints, free_endpoint
+from bayesrace.transport import Credentials, Endpoints, free_endpoint, open_sessions, session
 from tests.network.cars import Course, Program, gentle_course
 from tests.programs import PATIENCE_S, until
 from tests.security.authority import Bundles, bundles, written
@@ -164,6 +165,37 @@ def test_a_certificate_that_is_not_valid_now_is_waited_for(
         check_running(program, name)
     assert program.said().count(wrong) == 1
     assert "Traceback" not in program.said()
+
+
+@pytest.mark.parametrize("stays", [False, True])
+def test_an_endpoint_that_is_gone_as_links_are_opened_anew_is_waited_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stays: bool
+) -> None:
+    """For some seconds; then the process is to be started again."""
+    init(tmp_path)
+    folder, where = add(tmp_path, "plant", "plant"), free_endpoint("tls")
+    endpoints = Endpoints(listen=(where,), credentials=Credentials.read(folder))
+    monkeypatch.setattr(session, "_REOPEN_S", 0.1 if stays else 60.0)
+    with open_sessions(endpoints, "plant") as sessions, socket.socket() as other:
+        close, before = sessions.close, sessions.current
+
+        def lose() -> None:
+            close()
+            other.bind(("127.0.0.1", int(where.rpartition(":")[2])))
+            other.listen()
+            if not stays:
+                threading.Timer(1.2, other.close).start()
+
+        monkeypatch.setattr(sessions, "close", lose)
+        add(tmp_path, "plant", None, renew=True)
+        sessions.links.look()
+        if stays:
+            with pytest.raises(RestartError, match=IN_USE):
+                sessions.renewed()
+        else:
+            assert sessions.renewed() not in (None, before)
+            assert sessions.links.used == Credentials.read(folder)
+        monkeypatch.undo()
 
 
 @pytest.mark.parametrize("stays", [False, True])

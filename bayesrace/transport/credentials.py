@@ -1,4 +1,4 @@
-"""A process's certificate: the files, whose it is, what the others are, and what ends with it.
+"""A process's certificate: the files, whose it is, and what the others are.
 
 A folder holds what one process needs, as ``bayesrace certs`` writes it: the authority's certificate
 (``ca.pem``), its own (``certificate.pem``) with the private key (``key.pem``), and
@@ -6,16 +6,12 @@ A folder holds what one process needs, as ``bayesrace certs`` writes it: the aut
 authority has signed and numbered that list; one with a lower number than the last is refused.
 """
 
-import logging
 import os
-import signal
 import stat
-import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Self
+from typing import TYPE_CHECKING, Final, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
@@ -28,11 +24,9 @@ if TYPE_CHECKING:
 
 __all__ = [
     "AUTHORITY", "CERTIFICATE", "CERTIFICATE_EXPIRED", "CERTIFICATE_NOT_YET", "COVERS", "EVERY_CAR",
-    "KEY", "MEMBERS", "NEWEST_LIST", "Credentials", "Member", "Members", "Watch", "calendar",
-    "check_private", "watching",
+    "KEY", "MEMBERS", "NEWEST_LIST", "Credentials", "Member", "Members", "calendar",
+    "check_private",
 ]  # fmt: skip
-
-_log = logging.getLogger("bayesrace.links")
 
 AUTHORITY: Final = "ca.pem"
 CERTIFICATE: Final = "certificate.pem"
@@ -56,19 +50,10 @@ CERTIFICATE_NOT_YET: Final = 9
 """OpenSSL's numbers of what is wrong with a certificate."""
 
 _SOON_S: Final = 14 * 86400.0
-_REMINDER_S: Final = 86400.0
-_CALENDAR_S: Final = 1.0
-"""Longest time between two looks at the calendar, which somebody may set."""
-
-_interrupting: Final = threading.Lock()
-"""Held once an expiry interrupts the process, which may have several sessions with one certificate;
-until the process, which has not ended, opens another session."""
 
 _COPYING_S: Final = 5.0
 """So long after the last change of a folder its files may still be being copied."""
 _COPY: Final = "copy the folder again, as 'bayesrace certs' wrote it"
-_ANY_TIME: Final = 0x200000
-"""OpenSSL's X509_V_FLAG_NO_CHECK_TIME, which Python's module ssl does not name."""
 
 
 class Member(BaseModel):
@@ -146,7 +131,12 @@ class Credentials(BaseModel):
 
     def client(self) -> "ssl.SSLContext":
         """For a link to another end, whose certificate is checked."""
-        return _context(self.folder, server=False)
+        import ssl  # 1.4 MB, which a process without certificates does not need
+
+        context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+        context.load_verify_locations(self.folder / AUTHORITY)
+        context.load_cert_chain(self.folder / CERTIFICATE, self.folder / KEY)
+        return context
 
     @property
     def member(self) -> Member | None:
@@ -202,116 +192,12 @@ class Credentials(BaseModel):
         )
 
 
-@contextmanager
-def watching(watch: "Watch", failure: type[InputError] = InputError) -> Iterator[None]:
-    """For the block, a thread looks at the folder once a second.
-
-    The expiry of the certificate in use interrupts the main thread; then the end of the block
-    raises ``failure`` with the reason. Zenoh closes such links, but opens them again.
-
-    Started in another thread, it only logs the reason. The log warns of the expiry each day for two
-    weeks before.
-    """
-    in_main = threading.current_thread() is threading.main_thread()
-    if in_main and _interrupting.locked():
-        _interrupting.release()
-    over, expired = threading.Event(), threading.Event()
-
-    def wait() -> None:
-        if not _outlasted(watch, over):
-            return
-        expired.set()
-        if not in_main:
-            _log.error("%s", watch.used.expired())
-        elif _interrupting.acquire(blocking=False):
-            # Not to the process: another thread would get it, and the main one would sleep on.
-            signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
-
-    thread = threading.Thread(target=wait, name="expiry", daemon=True)
-    thread.start()
-    try:
-        try:
-            yield
-        finally:
-            over.set()
-            thread.join()
-    except (InputError, KeyboardInterrupt) as error:
-        if expired.is_set():
-            raise failure(watch.used.expired()) from error
-        raise
-    if expired.is_set():
-        raise failure(watch.used.expired())
-
-
-class Watch:
-    """What is in the folder of a certificate while its process runs."""
-
-    def __init__(
-        self,
-        own: Credentials,
-        role: Role,
-        changed: Callable[[Members], None],
-        each_time: Callable[[], None],
-    ) -> None:
-        """``changed`` is called with each newer list of members, ``each_time`` at each look."""
-        self.used = self.newest = own
-        """With which the session was opened, and with which the next one can be."""
-        self.members = own.members
-        """The newest list, of a folder whose certificate may not be usable."""
-        self._role, self._changed, self._each_time = role, changed, each_time
-        self._stamps, self._said = tuple[Any, ...](), ""
-
-    def look(self) -> None:
-        """Reads it again if a file has changed; the log says what cannot be used."""
-        self._each_time()
-        before, self._stamps = self._stamps, _stamps(self.used.folder)
-        if before == self._stamps:
-            return
-        try:
-            now = Credentials.read(self.used.folder)
-            now.members.check_newer(self.members.number, now.folder / MEMBERS)
-            if now.members != self.members:
-                self.members = now.members
-                self._changed(now.members)
-            now.check(self._role)
-        except (OSError, ValueError) as error:  # read again at the next look: it may pass
-            self._stamps = ()
-            if (text := str(error)) != self._said:
-                _log.warning("%s; what was read before stays in use", text)
-            self._said = text
-            return
-        self.newest = now
-
-
-def _outlasted(watch: Watch, over: threading.Event) -> bool:
-    """Waits for the expiry; False if it is over before."""
-    remind_s = 0.0
-    while (left_s := watch.used.ends_s - time.time()) > 0:
-        if time.monotonic() >= remind_s and (warning := watch.newest.expires_soon()):
-            _log.warning("%s", warning)
-            remind_s = time.monotonic() + _REMINDER_S
-        if over.wait(min(left_s, _CALENDAR_S)):
-            return False
-        watch.look()
-    return True
-
-
 def _just_changed(folder: Path) -> bool:
     try:
         changed_s = max(path.stat().st_ctime for path in (folder, *folder.iterdir()))
     except OSError:  # while we look
         return True
     return abs(time.time() - changed_s) < _COPYING_S
-
-
-def _stamps(folder: Path) -> tuple[Any, ...]:
-    """What differs as soon as a file does."""
-    stamps = []
-    for name in (AUTHORITY, CERTIFICATE, KEY, MEMBERS):
-        with suppress(OSError):
-            status = (folder / name).stat()
-            stamps.append((name, status.st_ino, status.st_ctime_ns))
-    return tuple(stamps)
 
 
 def _members(folder: Path) -> Members:
@@ -367,46 +253,31 @@ def calendar(time_s: float | None = None) -> str:
     return time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(time_s))
 
 
-def _context(folder: Path, server: bool) -> "ssl.SSLContext":
-    """What one end of a link with the certificate in that folder has; both ends are checked."""
-    import ssl  # 1.4 MB, which a process without certificates does not need
-
-    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER if server else ssl.PROTOCOL_TLS_CLIENT)
-    context.verify_mode = ssl.CERT_REQUIRED
-    context.load_verify_locations(folder / AUTHORITY)
-    context.load_cert_chain(folder / CERTIFICATE, folder / KEY)
-    return context
-
-
 def _verified(folder: Path) -> tuple[str, float, float]:
-    """Name, begin and end of the certificate, by a handshake with itself; else InputError."""
-    import ssl  # as above
+    """Name, begin and end of the certificate; InputError if it cannot be used."""
+    from cryptography import x509  # as above
+    from cryptography.exceptions import InvalidSignature
+    from cryptography.hazmat.primitives.serialization import load_pem_private_key
 
     try:
-        server, client = _context(folder, server=True), _context(folder, server=False)
-    except ssl.SSLError as error:
-        reason = (error.reason or str(error)).replace("_", " ").lower()
+        authority, one = (
+            x509.load_pem_x509_certificate((folder / name).read_bytes())
+            for name in (AUTHORITY, CERTIFICATE)
+        )
+        key = load_pem_private_key((folder / KEY).read_bytes(), None)
+        if key.public_key() != one.public_key():
+            raise ValueError("another key")
+    except (TypeError, ValueError) as error:
         raise InputError(
-            f"{folder}: certificate, key and authority do not fit ({reason}): {_COPY}"
+            f"{folder}: certificate, key and authority do not fit ({error}): {_COPY}"
         ) from None
-    # The server judges, but for the times; a certificate may be for clients alone.
-    server.verify_flags |= _ANY_TIME
-    client.check_hostname, client.verify_mode = False, ssl.CERT_NONE
-    to_server, to_client = ssl.MemoryBIO(), ssl.MemoryBIO()
-    one = server.wrap_bio(to_server, to_client, server_side=True)
-    other = client.wrap_bio(to_client, to_server)
     try:
-        for _ in range(4):
-            for end in (other, one):
-                with suppress(ssl.SSLWantReadError):
-                    end.do_handshake()
-    except ssl.SSLCertVerificationError as error:
-        why = f"is not of the authority in {AUTHORITY} ({error.verify_message}): {_COPY}"
+        one.verify_directly_issued_by(authority)
+    except (InvalidSignature, TypeError, ValueError):
+        why = f"is not of the authority in {AUTHORITY}: {_COPY}"
         raise InputError(f"certificate in {folder} {why}") from None
-    found = one.getpeercert() or {}
-    subject = {str(pair[0]): str(pair[1]) for group in found["subject"] for pair in group}
     begins_s, ends_s = (
-        ssl.cert_time_to_seconds(str(found[one])) for one in ("notBefore", "notAfter")
+        at.timestamp() for at in (one.not_valid_before_utc, one.not_valid_after_utc)
     )
     if not begins_s <= (now_s := time.time()) < ends_s:
         raise TransientError(
@@ -415,4 +286,5 @@ def _verified(folder: Path) -> tuple[str, float, float]:
             f"machine says {calendar(now_s)}: set the clock if that is wrong, or renew it with "
             "'bayesrace certs add NAME --renew'"
         )
-    return subject["commonName"], begins_s, ends_s
+    (name,) = one.subject.get_attributes_for_oid(x509.NameOID.COMMON_NAME)
+    return str(name.value), begins_s, ends_s

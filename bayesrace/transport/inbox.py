@@ -17,6 +17,7 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from enum import Enum
+from functools import partial
 from typing import Any, Final, NamedTuple, TypeVar
 
 import zenoh
@@ -199,9 +200,11 @@ class Inbox:
         """Receive the appearance of the first process of each source, and the disappearance of the
         last one; those present now included."""
 
-        def on_token(sample: Any) -> None:
+        def on_token(session: Any, sample: Any) -> None:
             key, _, node = str(sample.key_expr).rpartition("/")
             with self._lock:
+                if session is not self._session:  # of before
+                    return
                 before = self._nodes.get(key, frozenset())
                 now = before - {node} if sample.kind == zenoh.SampleKind.DELETE else before | {node}
                 if len(now) <= _NODES:
@@ -210,18 +213,21 @@ class Inbox:
                     kind = Kind.ALIVE if now else Kind.GONE
                     self._offer(kind, key.rpartition("/")[2], None, key)
 
-        watched, handler = self._key(ALIVE, source), in_transport_thread(on_token)
-        self._declare(
-            lambda: self._session.liveliness().declare_subscriber(watched, handler, history=True)
-        )
+        def declare() -> Any:
+            handler = in_transport_thread(partial(on_token, self._session))
+            tokens = self._session.liveliness()
+            return tokens.declare_subscriber(self._key(ALIVE, source), handler, history=True)
+
+        self._declare(declare)
 
     def bind(self, session: Any) -> None:
         """Receive the same over this session from now on; that of before is closed."""
-        self._session = session
         self._channels.clear()
-        for source in self.alive:
-            self._offer(Kind.GONE, source, None)
         with self._lock:
+            self._session = session
+            for key, nodes in self._nodes.items():
+                if nodes:
+                    self._offer(Kind.GONE, key.rpartition("/")[2], None, key)
             self._nodes.clear()
         self._seen = {}  # their links are others now
         self._declared = [declare() for declare in self._declarations]

@@ -13,6 +13,7 @@ dropped; a name that is not in the list of members may do nothing.
 import errno
 import json
 import logging
+import math
 import os
 import re
 import time
@@ -38,15 +39,7 @@ from bayesrace.messages import (
     Source,
 )
 from bayesrace.realtime import short_slices
-from bayesrace.transport.credentials import (
-    AUTHORITY,
-    CERTIFICATE,
-    KEY,
-    Credentials,
-    Members,
-    Watch,
-    watching,
-)
+from bayesrace.transport.credentials import AUTHORITY, CERTIFICATE, KEY, Credentials, Members
 from bayesrace.transport.endpoints import (
     Endpoints,
     address_of,
@@ -54,7 +47,7 @@ from bayesrace.transport.endpoints import (
     leaves,
     unreachable,
 )
-from bayesrace.transport.links import LINKS, Links
+from bayesrace.transport.links import LINKS, Links, watching
 from bayesrace.transport.requests import in_transport_thread
 
 __all__ = [
@@ -84,6 +77,8 @@ _SERVERS: Final[tuple[Role, ...]] = ("plant", "controller", "router")
 """Processes that wait as long as they run, for an endpoint to listen on, too."""
 _LISTEN_S: Final = 0.5
 """Time between two attempts to listen."""
+_REOPEN_S: Final = 5.0
+"""How long they go on where a session is opened anew, before the process starts again."""
 _PASSING: Final = (errno.EADDRINUSE, errno.EADDRNOTAVAIL, *PASSING)
 """Why an endpoint cannot be listened on now, and may be later: another process has it or has just
 ended, the network of this machine is not up yet, the system is short of something."""
@@ -224,22 +219,19 @@ class Sessions:
 
     def __init__(self, endpoints: Endpoints, role: Role) -> None:
         self._endpoints, self._role, self._stack = endpoints, role, ExitStack()
-        self._links: Links | None = None
-        own = endpoints.credentials
-        self.watch = None if own is None else Watch(own, role, self._update, self._report)
+        self.links = Links(endpoints.credentials, role)
         # A thread that the system treats as all others, whatever becomes of the calling one.
         self._opener = ThreadPoolExecutor(1)
-        if own is not None and role in _SERVERS:
+        if endpoints.credentials is not None and role in _SERVERS:
             self._opener.submit(int)
         self.current: Any = None
         """Open, of Zenoh."""
 
-    def open(self, *, peers_follow: bool = False, waits: bool) -> None:
-        """Opens it; ``waits``: for an endpoint to listen on."""
-        opened = _opened(self._endpoints, self._role, peers_follow, waits)
-        self.current, self._links = self._stack.enter_context(opened)
-        if self.watch is not None:
-            self._links.update(self.watch.members)  # which may have become newer meanwhile
+    def open(self, *, peers_follow: bool = False, patience_s: float) -> None:
+        """Opens it; goes on trying for so long where an endpoint cannot be listened on now."""
+        links = self.links
+        opened = _opened(self._endpoints, self._role, links, peers_follow, patience_s)
+        self.current = self._stack.enter_context(opened)
 
     def close(self) -> None:
         """Closes it."""
@@ -252,29 +244,21 @@ class Sessions:
         What was declared in the session has to be declared again, see :meth:`.Inbox.bind`. Raises
         RestartError if it cannot be opened.
         """
-        watch = self.watch
-        if watch is None or watch.newest == watch.used:
+        newest = self.links.newest
+        if newest is None or newest == self.links.used:
             return None
-        watch.used = watch.newest
-        self._endpoints = self._endpoints.model_copy(update={"credentials": watch.used})
         try:
-            self._opener.submit(self._reopen).result()
+            self._opener.submit(self._reopen, newest).result()
         except InputError as error:
             raise RestartError(str(error)) from error
-        _log.info("links are opened anew, with list %d of members", watch.used.members.number)
+        _log.info("links are opened anew, with list %d of members", newest.members.number)
         return self.current
 
-    def _reopen(self) -> None:
+    def _reopen(self, newest: Credentials) -> None:
         self.close()
-        self.open(waits=False)
-
-    def _update(self, members: Members) -> None:
-        if self._links is not None:
-            self._links.update(members)
-
-    def _report(self) -> None:
-        if self._links is not None:
-            self._links.report()
+        self.links.used = newest
+        self._endpoints = self._endpoints.model_copy(update={"credentials": newest})
+        self.open(patience_s=_REOPEN_S)
 
 
 @contextmanager
@@ -298,10 +282,11 @@ def open_sessions(
     failure = RestartError if role in _SERVERS else InputError
     sessions = Sessions(endpoints, role)
     with (
-        nullcontext() if sessions.watch is None else watching(sessions.watch, failure),
+        nullcontext() if endpoints.credentials is None else watching(sessions.links, failure),
         closing(sessions),
     ):
-        sessions.open(peers_follow=peers_follow, waits=role in _SERVERS)
+        patience_s = math.inf if role in _SERVERS else 0.0
+        sessions.open(peers_follow=peers_follow, patience_s=patience_s)
         missing: list[str] = []
         if reports_absence and not peers_follow:
             with short_slices():  # Zenoh may start threads for these calls, too
@@ -344,9 +329,9 @@ def _unlinked(session: Any, endpoints: Endpoints) -> list[str]:
 
 @contextmanager
 def _opened(
-    endpoints: Endpoints, role: Role, peers_follow: bool, waits: bool
-) -> Iterator[tuple[Any, Links]]:
-    said = ""
+    endpoints: Endpoints, role: Role, links: Links, peers_follow: bool, patience_s: float
+) -> Iterator[Any]:
+    said, ends_s = "", time.monotonic() + patience_s
     while True:
         try:
             with short_slices():
@@ -354,13 +339,12 @@ def _opened(
             break
         except zenoh.ZError as error:
             failure = _not_opened(endpoints, error)
-        if not waits or not isinstance(failure, TransientError):
+        if time.monotonic() >= ends_s or not isinstance(failure, TransientError):
             raise failure
         if (text := str(failure)) != said:
             _log.warning("%s; this goes on trying", text)
         said = text
         time.sleep(_LISTEN_S)
-    links = Links(None if endpoints.credentials is None else endpoints.credentials.members)
     with session:
         with short_slices():
             on_link = in_transport_thread(links.on_event)
@@ -373,10 +357,11 @@ def _opened(
             number = str(session.info.zid())
             LINKS[number] = links
             try:
-                yield session, links
+                yield session
             finally:
                 del LINKS[number]
                 links.report()
+    links.clear()
 
 
 def _not_opened(endpoints: Endpoints, error: Exception) -> InputError:

@@ -19,7 +19,7 @@ from typing import Final
 
 from bayesrace.transport.endpoints import check_descriptors
 
-__all__: list[str] = []
+__all__ = ["client_hello"]
 
 _HOLD_S: Final = 3.0
 """Longer than a handshake may take, so that it is the other end that gives up."""
@@ -29,7 +29,7 @@ _NO_PORT: Final = 24
 """IP_BIND_ADDRESS_NO_PORT: the port is chosen when the other end is known."""
 
 
-def _greeting() -> bytes:
+def client_hello() -> bytes:
     """A ClientHello."""
     context, out = ssl.create_default_context(), ssl.MemoryBIO()
     begun = context.wrap_bio(ssl.MemoryBIO(), out, server_hostname="plant")
@@ -51,7 +51,7 @@ def _opened(host: str, port: int, source: str) -> socket.socket:
 def main(host: str, port: str, rate: str, words: str, *sources: str) -> None:
     """Opens connections until the end of stdin, for a minute at most."""
     check_descriptors()
-    greeting = _greeting() if words == "greeting" else b""
+    greeting = client_hello() if words == "greeting" else b""
     begun, accepted, held = 0, 0, deque[tuple[float, socket.socket]]()
     connecting, turns = dict[int, socket.socket](), cycle(sources)
     poll = select.epoll()

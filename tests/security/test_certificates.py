@@ -6,6 +6,7 @@ import stat
 from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from cryptography import x509
@@ -15,6 +16,8 @@ from bayesrace.errors import InputError
 from bayesrace.files import claimed
 from bayesrace.operation import certificates
 from bayesrace.transport import Credentials
+from bayesrace.transport import links as links_module
+from bayesrace.transport.links import Links
 from tests.command_line import Cli, refused
 from tests.security.authority import Bundles, bundles
 
@@ -191,6 +194,39 @@ def test_a_folder_that_cannot_be_used_is_refused_with_the_remedy(
     spoil(folder, bundles)
     with pytest.raises(InputError, match=words):
         Credentials.read(folder)
+
+
+def test_a_folder_that_stays_unusable_is_read_again_when_it_changes_or_much_later(
+    bundles: Bundles, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A clock that is set, so that its certificate counts, does not change it."""
+    folder, clock, reads = tmp_path / "plant", SimpleNamespace(monotonic=lambda: 0.0), list[Path]()
+    shutil.copytree(bundles.path("plant"), folder)
+    links, read = Links(Credentials.read(folder), "plant"), Credentials.read
+    monkeypatch.setattr(links_module, "time", clock)
+
+    def reading(folder: Path) -> Credentials:
+        reads.append(folder)
+        return read(folder)
+
+    monkeypatch.setattr(Credentials, "read", reading)
+
+    def looked(times: int) -> int:
+        before = len(reads)
+        for _ in range(times):
+            links.look()
+        return len(reads) - before
+
+    assert looked(5) == 1
+    shutil.copy(bundles.path("controller") / "key.pem", folder / "key.pem")
+    assert looked(5) == 1
+    _spoilt_list(folder)
+    assert looked(5) == 1
+    clock.monotonic = lambda: 11.0
+    assert looked(5) == 1
+    shutil.copytree(bundles.path("plant"), folder, dirs_exist_ok=True)
+    assert looked(5) == 1
+    assert links.newest == links.used
 
 
 def test_a_list_with_a_lower_number_than_the_last_one_is_refused(tmp_path: Path) -> None:

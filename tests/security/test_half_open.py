@@ -245,6 +245,44 @@ def passing_through(hosts: Hosts) -> Iterator[None]:
         process.wait()
 
 
+ANSWERER: Final = """
+import socket
+with socket.create_server(("127.0.0.1", 17447)) as listener:
+    while True:
+        listener.accept()[0].sendall(b"x")
+"""
+REACHING: Final = """
+import socket, sys
+from contextlib import suppress
+from tests.security.half_open import client_hello
+reached, (host, *sources) = 0, sys.argv[1:]
+for source in sources:
+    with suppress(OSError), socket.create_connection((host, 7447), 5.0, (source, 0)) as one:
+        one.sendall(client_hello())
+        reached += one.recv(1) == b"x"
+print(reached)
+"""
+
+
+def test_the_proxy_counts_each_host_of_ipv4_and_each_64_of_ipv6(hosts: Hosts) -> None:
+    """A host may take any address of its /64."""
+    needs("haproxy")
+
+    def reached(host: str, *sources: str) -> int:
+        command = [*hosts.others, sys.executable, "-c", REACHING, host, *sources]
+        return int(subprocess.run(command, cwd=ROOT, capture_output=True, check=True).stdout)
+
+    answerer = subprocess.Popen([*hosts.board, sys.executable, "-c", ANSWERER])
+    try:
+        with passing_through(hosts):
+            until(lambda: reached(BOARD, ATTACKERS[4]), "the proxy")
+            assert reached(BOARD, *ATTACKERS[:3] * 4) == 6
+            assert reached("fd77::1", *("fd77::2", "fd77::11") * 4) == 2
+    finally:
+        answerer.kill()
+        answerer.wait()
+
+
 LISTENER: Final = """
 import socket
 with socket.create_server(("", 7447), family=socket.AF_INET6, backlog=4096, dualstack_ipv6=True):

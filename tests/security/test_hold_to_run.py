@@ -241,6 +241,9 @@ def test_a_plant_may_demand_the_switch(tmp_path: Path, course: Course, bundles: 
     with held(tmp_path, course, bundles) as rig:
         rig.drive.process.send_signal(signal.SIGINT)
         rig.drive.process.wait(30.0)
+        time.sleep(NOTICED_S + LATE_S)
+        for source in ("plant", "controller"):  # whoever ends a run is not missing
+            assert rig.status(source)["holds_lost"] == 0
         plan = RunPlan(2, "test", 1, 2.0, lockstep=False)
         with pytest.raises(InputError, match="--hold-to-run"):
             rig.director.start(run_request(course.track, plan))
