@@ -1,8 +1,7 @@
 """Control never waits for observers: those that stop reading, read slowly or vanish.
 
 Zenoh's sockets linger for 10 s when they are closed, in a thread that serves all links. Without
-``session._close_without_waiting`` the plant gets no commands for 9 s once the lease of such a link
-is over.
+``Links.tend`` the plant gets no commands for 9 s once the lease of such a link is over.
 """
 
 import math
@@ -12,6 +11,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -31,8 +31,10 @@ __all__ = ["bundles"]
 pytestmark = [pytest.mark.wall_clock, pytest.mark.unmeasured]
 
 LEASE_S = 5.0
-MOST_UNDRIVEN = 25
-"""The machine stalls now and then."""
+LOOK_S = 2.0
+MOST_UNDRIVEN = 50
+"""Of the 100 periods between two looks: a machine with other work stalls now and then, and was seen
+to miss 31 of 500 so. A plant that waits gets no command for 9 s."""
 
 
 @pytest.fixture(scope="module")
@@ -65,10 +67,12 @@ def undriven(counters: Mapping[str, Any]) -> int:
 
 def check_driven(braked: Callable[[], int], trouble: Callable[[], None]) -> None:
     """The car is driven until long after the leases of links in trouble are over."""
-    before = braked()
+    counts = [braked()]
     trouble()
-    time.sleep(LEASE_S + 5.0)
-    assert braked() - before <= MOST_UNDRIVEN
+    for _ in range(round((LEASE_S + 5.0) / LOOK_S)):
+        time.sleep(LOOK_S)
+        counts.append(braked())
+    assert max(b - a for a, b in pairwise(counts)) <= MOST_UNDRIVEN, counts
 
 
 def stopped(process: subprocess.Popen[str]) -> Callable[[], None]:
