@@ -9,7 +9,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum, StrEnum
-from typing import Final
+from typing import Any, Final
 
 from bayesrace.controller.estimator import MOST_INSTRUMENTS, Belief, Measurement, fill, read
 from bayesrace.controller.interface import Controller, Environment, StepOutput
@@ -226,6 +226,16 @@ class Driver:
             [value for value, _ in values.values()],
             [deviation for _, deviation in values.values()],
         )
+
+    @property
+    def instruments(self) -> dict[str, Any]:
+        """What has become of the readings of each instrument so far: a br_instrument."""
+        library = self._library
+        estimator = library.br_cycle_estimator(self._cycle)
+        return {
+            name: library.br_estimator_instrument(estimator, number)
+            for name, number in self._instruments.items()
+        }
 
     @property
     def vx_mps(self) -> float:

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, Final
 
 from bayesrace.controller.driver import Driver, Level, Phase
+from bayesrace.controller.instruments import Instruments
 from bayesrace.controller.weights.manager import WeightUpdateManager
 from bayesrace.messages import (
     COMMAND,
@@ -42,6 +43,7 @@ class Service:
         self._rate_hz = rate_hz
         self._driver = driver
         self._controller = driver.controller
+        self._instruments = Instruments(driver)
         self._counters = counters
         self._presence = presence
         self.weights: WeightUpdateManager | None = None
@@ -152,6 +154,8 @@ class Service:
 
     def _words(self) -> str:
         driver, words = self._driver, [self._text]
+        if said := self._instruments.words():
+            words.append(said)
         if fault := driver.fault:
             words.append(f"sensor fault '{fault}': {driver.fault_text}; {_REMEDY}")
         failed = driver.count("failed")

@@ -18,13 +18,16 @@ from bayesrace.log import LogWriter
 from bayesrace.operation.closed_loop import ClosedLoop, Driven, built_in_car
 from bayesrace.plant.settings import SensorNoise
 from bayesrace.plant.vehicle import FmuFault, Vehicle
-from bayesrace.raceline import RaceLine, RaceLineSettings
+from bayesrace.raceline import RaceLine, RaceLineSettings, read_raceline_for
 from bayesrace.raceline.friction import timed_line
-from bayesrace.tracks import Track
+from bayesrace.tracks import Track, load_track
 from bayesrace.tracks.spline import fit_arc_length
 from bayesrace.vehicles import CarParameters, car_text
 
-__all__ = ["collect", "drive_length_s", "room_beside", "training_line", "training_margin_m"]
+__all__ = [
+    "collect", "drive_length_s", "pursuit_controller", "room_beside", "training_line",
+    "training_margin_m",
+]  # fmt: skip
 
 _ATTEMPTS: Final = 8
 _SLOWER: Final = 0.93
@@ -85,6 +88,29 @@ def collect(
         if float(track.project_path(driven.x[:, :2]).off_track_m.max()) <= 0:
             break
     return driven
+
+
+def pursuit_controller(
+    artefact: Path,
+    car: CarParameters,
+    track: str,
+    raceline: Path,
+    speed_scale: float,
+    step_s: float,
+) -> PythonController:
+    """Pure pursuit in place of the compiled controller, along what a training drive follows.
+
+    ``speed_scale``: mean share of the line's speed; ``step_s``: period of the control cycle.
+    """
+    course = load_track(track, car.width_m)
+    line = training_line(course, read_raceline_for(raceline, course, car), car, "calm")
+    settings = PurePursuitSettings(style="calm", speed_scale=speed_scale, step_s=step_s)
+    law = PurePursuit(
+        car, line.x_m, line.y_m, line.vx_mps, settings, room_m=room_beside(course, line)
+    )
+    controller = PythonController(artefact, law)
+    controller.track = course.identity
+    return controller
 
 
 def training_margin_m(track: Track, car: CarParameters, margin_m: float | None = None) -> float:

@@ -15,6 +15,7 @@ from typing import Final
 import numpy as np
 
 from bayesrace.messages import RunRequest, State, Truth
+from bayesrace.plant.hardware import Hardware
 from bayesrace.plant.settings import SensorNoise
 from bayesrace.plant.vehicle import FmuFault, Vehicle
 from bayesrace.tracks.track import CrossingLine
@@ -126,7 +127,8 @@ class CarRun:
             request.line_right_m,
         )
         vehicle.reset(request.x0)
-        self._line.restart(request.x0[0], request.x0[1])
+        start = vehicle.x.tolist() if isinstance(vehicle, Hardware) else request.x0
+        self._line.restart(start[0], start[1])
 
     @property
     def laps(self) -> int:
@@ -144,20 +146,21 @@ class CarRun:
         """What the sensors measure now, and the true state (7,); see :func:`truth_behind`."""
         vehicle, request = self.vehicle, self.request
         now_ns, x = time.monotonic_ns(), tuple(vehicle.x.tolist())
+        readings = vehicle.readings() if isinstance(vehicle, Hardware) else None
         state = State(
             seq=seq,
             source_time_ns=now_ns,
             epoch=self._epoch,
             run=request.run,
             time_s=vehicle.time_s,
-            x=self._sensors.measure(x),
+            x=self._sensors.measure(x) if readings is None else (0.0,) * len(x),
             u_applied=vehicle.u_applied,
             lap=self._line.crossings,
             lockstep=request.lockstep,
             actuation_delays=actuation_delays or self._delays,
             final=final,
-            estimated=False,
-            readings=(),
+            estimated=readings is not None,
+            readings=readings or (),
         )
         return state, x
 

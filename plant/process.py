@@ -5,6 +5,7 @@ import logging
 import secrets
 import time
 from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict
 from typing import Any
 
@@ -24,6 +25,7 @@ from bayesrace.messages import (
     Status,
 )
 from bayesrace.plant.car import End, Sensors
+from bayesrace.plant.hardware import Hardware
 from bayesrace.plant.process_settings import PlantSettings
 from bayesrace.plant.run import Run, RunCounters
 from bayesrace.plant.vehicle import Compile, FmuFault, Vehicle, open_vehicle
@@ -77,7 +79,8 @@ class PlantProcess:
         self._run: Run | None = None
         self._run_number = 0
         self._runs = 0
-        self._text = f"no run so far with {_simulated_by(settings)}"
+        self._hardware = vehicle if isinstance(vehicle, Hardware) else None
+        self._text = f"no run so far with {_played_by(settings, vehicle)}"
         self._stopping = False
         self._spare_s = 0.0
         """From when on links may be opened anew."""
@@ -142,6 +145,8 @@ class PlantProcess:
                 "this plant was started for lockstep (--low-latency): "
                 "start it without to drive in real time"
             )
+        if message.lockstep and self._hardware is not None:
+            return "a real car does not wait for its controller: drive with --mode realtime"
         if message.held and message.lockstep:
             return "hold-to-run is for real time (--mode realtime): lockstep waits for its director"
         if self._settings.hold_to_run and not message.held:
@@ -290,6 +295,12 @@ class PlantProcess:
             return End("abandoned", f"{gone} for {_ABANDONED_S:g} s")
         return None
 
+    @property
+    def _words(self) -> str:
+        if self._hardware is None:
+            return self._text
+        return f"{self._text}; {self._hardware.report()}"
+
     def _status(self, seq: int = 0) -> Status:
         phase = "idle" if self._run is None else "running"
         now_ns = time.monotonic_ns()
@@ -300,7 +311,7 @@ class PlantProcess:
             phase=phase,
             epoch=self._epoch,
             run=self._run_number,
-            text=self._text[:2000],
+            text=self._words[:2000],
             weights_version="",
             track="",
             rate_hz=self._settings.rate_hz,
@@ -313,30 +324,40 @@ class PlantProcess:
         )
 
 
-def _simulated_by(settings: PlantSettings) -> str:
+def _played_by(settings: PlantSettings, vehicle: Vehicle) -> str:
+    if isinstance(vehicle, Hardware):
+        return "a real car"
     if settings.fmu is not None:
         return f"FMU {settings.fmu.name}"
     return "the built-in car" if settings.simulator == "equations" else settings.simulator
 
 
-def main(settings: PlantSettings, compiled: Compile | None = None) -> int:
+def main(
+    settings: PlantSettings, compiled: Compile | None = None, hardware: Hardware | None = None
+) -> int:
     """Run a plant until SIGINT or SIGTERM; returns the exit code. Raises InputError at a bad start.
 
     ``compiled``: of the car's equations, see :class:`bayesrace.plant.simulator.Simulator`.
+    ``hardware``: the real car, which is open, instead of a simulated one.
     Call it from the main thread of a process: it takes over the signals.
     """
     die_with_parent(settings.parent_pid)
-    vehicles = open_vehicle(
+    vehicles: AbstractContextManager[Vehicle]
+    vehicles = nullcontext(hardware) if hardware else open_vehicle(
         settings.car, settings.fmu, settings.fmu_map, settings.rate_hz, compiled,
         simulator=settings.simulator,
     )  # fmt: skip
+    if hardware is not None and settings.delay_s:
+        raise InputError("a real car has delays of its own: leave out delay_s")
     settings.endpoints.check_car(settings.name or settings.car.name)
     with vehicles as vehicle, open_sessions(settings.endpoints, "plant") as sessions:
         process = PlantProcess(sessions.current, settings, vehicle)
         for refusal in prepare_thread(settings.realtime):
             _log.warning("%s", refusal)
         where = ", ".join(settings.endpoints.listen)
-        _log.info("plant of car '%s', %s, on %s", process.name, _simulated_by(settings), where)
+        _log.info(
+            "plant of car '%s', %s, on %s", process.name, _played_by(settings, vehicle), where
+        )
         with process.inbox.receive_signals():
             process.serve(sessions.renewed)
     return 0

@@ -5,10 +5,12 @@ import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import chain
 from typing import Final, NamedTuple
 
 from bayesrace.messages import ACTUATION, Actuation, BrakingPlan, Decoder, RunRequest, State, Truth
 from bayesrace.plant.car import CarRun, End, Sensors, drive_lockstep, fault_end, truth_behind
+from bayesrace.plant.hardware import Hardware
 from bayesrace.plant.vehicle import Command, FmuFault, Vehicle, planned_at
 from bayesrace.realtime import SUSPENDED_S, sleep_until_ns
 from bayesrace.transport import LOCKSTEP_SPIN_S, Inbox, Item, Kind, Numbering, Publisher
@@ -46,6 +48,10 @@ class RunCounters:
     """Times that the process did not run for a second or more; plant time stood still meanwhile."""
     holds_lost: int = 0
     """Held runs whose director was missing, so that the car was stopped."""
+
+
+def _decided(one: Actuation) -> float:
+    return one.decided_at_s
 
 
 class _Waiting(NamedTuple):
@@ -94,7 +100,11 @@ class Run:
         self._held_since_s = self._interval_s = 0.0
         self._braking: BrakingPlan | None = None
         self._lost_s: float | None = None
-        """When the director was missing; nothing that arrives drives the car from then on."""
+        """When the director was missing, or a real car's run was over; nothing that arrives drives
+        the car from then on."""
+        self._over: End | None = None
+        """Why a real car is being stopped."""
+        self._hardware = self.simulator if isinstance(self.simulator, Hardware) else None
 
     @property
     def laps(self) -> int:
@@ -119,9 +129,10 @@ class Run:
             return self._real_time()
 
     def _send(self, state: State, x: tuple[float, ...]) -> None:
-        """The truth goes second: it must not delay the measurement."""
+        """The truth goes second: it must not delay the measurement. Of a real car there is none."""
         self.states.put(state, lockstep=state.lockstep)
-        self.truths.put(truth_behind(state, x), lockstep=state.lockstep)
+        if self._hardware is None:
+            self.truths.put(truth_behind(state, x), lockstep=state.lockstep)
 
     # Lockstep ----------------------------------------------------------------------------------
 
@@ -165,24 +176,26 @@ class Run:
         seq = self.states.next_seq
         first = self._car.sample(seq)
         start_ns, late_ns = first[0].source_time_ns, 0
+        self._anchor(start_ns)
         self._enqueue(*first)
         while True:
             begin_ns = start_ns + self.simulator.steps * period_ns
-            self._sleep_and_send(begin_ns + period_ns)
+            end = self._pass(begin_ns + period_ns)
             before_ns, late_ns = late_ns, time.monotonic_ns() - begin_ns - period_ns
             if late_ns - before_ns > SUSPENDED_S * 1e9:
                 # Not to be made up for: nobody could have driven the car meanwhile.
                 self.counters.suspended += 1
                 self.suspended(late_ns * 1e-9)
                 start_ns, begin_ns, late_ns = start_ns + late_ns, begin_ns + late_ns, 0
+                self._anchor(start_ns)
             self.counters.overruns += late_ns > period_ns
-            asked = self._receive()
+            asked = end or self._receive()
             if asked is None and self._lost_s is None and self.hold.missing:
                 self._lost_s = self._car.time_s
                 self.counters.holds_lost += 1
             delays, end = self._drive_period(begin_ns, begin_ns + period_ns, seq)
             # The controller learns from a final state that nobody holds this run any more.
-            end = end or self._finished() or asked
+            end = self._halting(end or self._finished() or asked)
             if end is not None and end.reason == "left_world":
                 return end  # no message could carry this state
             seq += 1
@@ -191,18 +204,57 @@ class Run:
                 if self._outbox:
                     self._sleep_and_send(self._outbox[-1][0])
                 return end
-            if (end := self.beat()) is not None:
+            if (end := self._halting(self.beat())) is not None:
                 return end
 
     def _finished(self) -> End | None:
-        """What ends the run in the state just reached; without its director, the car's standing."""
+        """What ends the run in the state just reached; of a car that is being stopped, that it
+        stands."""
         end = self._car.finished()
+        if end is None and self._hardware is not None and self._hardware.silent:
+            end = End("plant_fault", self._hardware.silent)
         if self._lost_s is None or (end is not None and end.reason == "left_world"):
             return end
-        vx_mps = float(self.simulator.x[3])
-        if abs(vx_mps) > _STANDING_MPS and self.time_s < self._lost_s + _STOPPING_S:
+        if self._rolls and self.time_s < self._lost_s + _STOPPING_S:
             return None
-        return End("hold_lost", f"stopped to {vx_mps:.2f} m/s: {HOLD_MISSING}")
+        vx_mps = float(self.simulator.x[3])
+        return self._over or End("hold_lost", f"stopped to {vx_mps:.2f} m/s: {HOLD_MISSING}")
+
+    @property
+    def _rolls(self) -> bool:
+        """Of a car that cannot be seen: that its braking plan is not over."""
+        if self._hardware is not None and self._hardware.silent:
+            return planned_at(self._braking, self.time_s) is not None
+        return abs(float(self.simulator.x[3])) > _STANDING_MPS
+
+    def _halting(self, end: End | None) -> End | None:
+        """A run of a real car does not end before it stands, unless it is asked to twice."""
+        if end is None or self._hardware is None or self._lost_s is not None:
+            return end
+        self._lost_s, self._over = self.time_s, end
+        return None
+
+    def _anchor(self, start_ns: int) -> None:
+        if self._hardware is not None:
+            self._hardware.begins(start_ns)
+
+    def _pass(self, until_ns: int) -> End | None:
+        """The rest of a period; a real car meanwhile does what comes as soon as it comes."""
+        if self._hardware is None:
+            self._sleep_and_send(until_ns)
+            return None
+        self._hardware.actuate(self._fresh(0))
+        acting = self._held
+        while (left_ns := until_ns - time.monotonic_ns()) > 0:
+            if (end := self._receive(left_ns * 1e-9)) is not None:
+                return end
+            new = max((one.actuation for one in self._waiting), key=_decided, default=None)
+            if new is None or self._lost_s is not None:
+                continue
+            if acting is None or _decided(new) > _decided(acting):
+                self._hardware.actuate(new.u)
+                acting = new
+        return None
 
     def _enqueue(self, state: State, x: tuple[float, ...]) -> None:
         """Send the state when its delay is over; keep in mind when it was sampled."""
@@ -220,11 +272,11 @@ class Run:
             self._send(state, x)
         sleep_until_ns(until_ns)
 
-    def _receive(self) -> End | None:
+    def _receive(self, wait_s: float = 0.0) -> End | None:
         """Takes what has arrived by now, and no more: requests without end must not hold up the
-        car. Returns what ends the run, if anything."""
-        for _ in range(self.inbox.queued):
-            item = self.inbox.get()
+        car. Returns what ends the run, if anything. ``wait_s``: for the first, at most."""
+        first = [self.inbox.get(wait_s)] if wait_s > 0 else []
+        for item in chain(first, (self.inbox.get() for _ in range(self.inbox.queued))):
             if item is None:
                 break
             if item.kind is Kind.MESSAGE:

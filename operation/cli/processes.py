@@ -15,6 +15,7 @@ from bayesrace.processes import die_with_parent
 
 if TYPE_CHECKING:
     from bayesrace.configuration import Configuration
+    from bayesrace.controller.interface import Controller
     from bayesrace.controller.process_settings import ControllerSettings
     from bayesrace.messages import Role
     from bayesrace.operation.lifecycle import Action
@@ -95,6 +96,13 @@ def controller(
         "as configured; tcp/127.0.0.1:7448",
     ),
     gate: Path | None = options.value("Thresholds for new weights (JSON): docs/learning.md."),
+    pursuit: float | None = options.value(
+        "Drive by pure pursuit instead, at this share of the line's speed: the first drive of a "
+        "real car, and training data.",
+        metavar="SHARE",
+        min=0.05,
+        max=2.0,
+    ),
     low_latency: bool = options.LOW_LATENCY,
     parent_pid: int | None = options.PARENT_PID,
 ) -> None:
@@ -109,9 +117,18 @@ def controller(
     )
     thresholds = read_settings(gate, GateSettings)
     chosen = settings(endpoints=endpoints, gate=thresholds, parent_pid=parent_pid)
-    driver = predictive_controller(
-        artefact, chosen.car, track, raceline, mpc, weights, store, chosen.gate
-    )
+    if pursuit is None:
+        driver: Controller = predictive_controller(
+            artefact, chosen.car, track, raceline, mpc, weights, store, chosen.gate
+        )
+    elif given := [one for one in (mpc, weights, store, gate) if one is not None]:
+        raise InputError(f"--pursuit drives without {given[0]}: leave out one of them")
+    else:
+        from bayesrace.operation.collect import pursuit_controller
+
+        driver = pursuit_controller(
+            artefact, chosen.car, track, raceline, pursuit, 1 / chosen.rate_hz
+        )
     raise typer.Exit(main(chosen, driver))
 
 

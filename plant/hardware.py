@@ -1,0 +1,274 @@
+"""A real car behind the plant process: its instruments in plant time, and commands as they come.
+
+Who has such a car writes a subclass of :class:`Hardware` that speaks the car's own protocol
+(examples/mocap_car/plant.py). All else is as for a simulated car: guard, braking plan, runs, laps.
+"""
+
+import math
+import threading
+import time
+from abc import abstractmethod
+from collections import deque
+from collections.abc import Mapping
+from typing import Final, NamedTuple, Self
+
+import msgspec
+import numpy as np
+
+from bayesrace.arrays import Floats
+from bayesrace.errors import InputError
+from bayesrace.integrators import PLANT_SUBSTEP_HZ
+from bayesrace.messages import Reading
+from bayesrace.plant.vehicle import Command, Vehicle
+from bayesrace.vehicles.parameters import CarParameters
+
+__all__ = ["Hardware", "Report"]
+
+_MOST: Final = 16
+"""Readings that one state has room for; the newest count."""
+_WINDOW_NS: Final = 5_000_000_000
+"""For so long the least delay of a clock counts: clocks drift apart by up to 0.1 ms a second."""
+_RESTARTED_NS: Final = 1_000_000_000
+"""A delay that is longer by this is a clock that has been set anew."""
+_POSE: Final = ("x", "y", "psi")
+_POSES: Final = 12
+"""Newest poses, by which the speed is known ..."""
+_EACH: Final = 3
+"""... and how many of them are one point: their median is no outlier."""
+_AHEAD: Final = (0.1, 10.0)
+"""Wheelbases by which a car stands past the start line when a run begins ..."""
+_ASIDE: Final = 5.0
+_TURNED_RAD: Final = 0.5
+"""... and the most that it is beside its point, and turned."""
+
+
+class Report(NamedTuple):
+    """What an instrument has measured at one moment."""
+
+    instrument: str
+    values: Mapping[str, tuple[float, float]]
+    """As :attr:`.Reading.values`: value and standard deviation by quantity."""
+    clock_s: float | None = None
+    """By the instrument's own clock, wherever that begins; None: it has none."""
+
+
+class _Instrument:
+    """When an instrument measures: its clock is ahead of ours by at most what is seen, as delays
+    only add to it."""
+
+    def __init__(self, delay_s: float) -> None:
+        self._delay_ns = round(delay_s * 1e9)
+        self._least_ns = self._before_ns = self._until_ns = 0
+        self.arrived_ns: deque[int] = deque(maxlen=100)
+
+    def measured_ns(self, clock_s: float | None, arrived_ns: int) -> int:
+        """The moment by our monotonic clock."""
+        known = bool(self.arrived_ns)
+        self.arrived_ns.append(arrived_ns)
+        if clock_s is None:
+            return arrived_ns - self._delay_ns
+        clock_ns = round(clock_s * 1e9)
+        late_ns = arrived_ns - clock_ns
+        if not known or late_ns - self._least_ns > _RESTARTED_NS:
+            self._least_ns = self._before_ns = late_ns
+            self._until_ns = arrived_ns + _WINDOW_NS
+        elif arrived_ns > self._until_ns:
+            self._before_ns, self._least_ns = self._least_ns, late_ns
+            self._until_ns = arrived_ns + _WINDOW_NS
+        self._least_ns = min(self._least_ns, late_ns)
+        return clock_ns + min(self._least_ns, self._before_ns) - self._delay_ns
+
+    def __str__(self) -> str:
+        times = self.arrived_ns
+        silent_s = (time.monotonic_ns() - times[-1]) * 1e-9
+        if silent_s > 1.0 or len(times) < 2:
+            return f"silent for {silent_s:.1f} s"
+        return f"{(len(times) - 1) / max((times[-1] - times[0]) * 1e-9, 1e-9):.0f} Hz"
+
+
+class Hardware(Vehicle):
+    """A real car; ``x`` is a guess by its newest poses, good enough to brake and to count laps.
+
+    A context manager: a thread waits in :meth:`receive` meanwhile.
+    """
+
+    def __init__(
+        self,
+        car: CarParameters,
+        rate_hz: float = 50.0,
+        delays_s: Mapping[str, float] | None = None,
+        silent_s: float = 0.5,
+    ) -> None:
+        """``rate_hz``: of the states. ``delays_s``: by instrument, the least time from measuring to
+        arrival. ``silent_s``: after so long without a pose the car is stopped, the run over."""
+        super().__init__(car, 1 / rate_hz, max(round(PLANT_SUBSTEP_HZ / rate_hz), 1))
+        self._delays_s, self._silent_ns = delays_s or {}, round(silent_s * 1e9)
+        self._reports: deque[tuple[Report, int]] = deque(maxlen=1000)
+        self._pending: deque[Reading] = deque(maxlen=_MOST)
+        self._instruments: dict[str, _Instrument] = {}
+        self._poses: deque[tuple[float, ...]] = deque(maxlen=_POSES)
+        self._posed_ns = -self._silent_ns
+        self._zero_ns: int | None = None
+        self.unusable = 0
+        """Reports that are no measurement."""
+        self._fault = ""
+        self._begun_s = self._counted_s = time.monotonic()
+        self._d = self._acted = 0.0
+        self._ramp = self._begun_s, 0.0, 0.0
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._listen, name="instruments", daemon=True)
+
+    @abstractmethod
+    def receive(self) -> Report | None:
+        """Waits for the next report; None: none has come for a while, 0.1 s at most."""
+
+    @abstractmethod
+    def send(self, d: float, delta_rad: float, rate_radps: float) -> None:
+        """The drive command from now on, and the steering angle to go to, at this rate."""
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._closing.set()
+        self._thread.join()
+
+    def _listen(self) -> None:
+        while not self._closing.is_set():
+            if (report := self.receive()) is not None:
+                self._reports.append((report, time.monotonic_ns()))
+
+    # What the car says -------------------------------------------------------------------------
+
+    def readings(self) -> tuple[Reading, ...]:
+        """What instruments have measured by now, in plant time, and not been asked for yet."""
+        self._take_reports()
+        found = tuple(one for one in self._pending if one.time_s <= self.time_s)
+        later = [one for one in self._pending if one.time_s > self.time_s]
+        self._pending.clear()
+        self._pending.extend(later)
+        return found
+
+    @property
+    def silent(self) -> str:
+        """Why the car is to be stopped: it is not seen, or cannot be told anything; else empty."""
+        if self._fault:
+            return f"no command reaches the car: {self._fault}"
+        if time.monotonic_ns() - self._posed_ns <= self._silent_ns:
+            return ""
+        return f"no pose of the car for {self._silent_ns * 1e-9:g} s: is it seen, is it on?"
+
+    def report(self) -> str:
+        """Which instruments report, and where the car is, for the plant's status."""
+        self._take_reports()
+        words = [f"{name} {one}" for name, one in sorted(self._instruments.items())]
+        if self._poses:
+            _, x, y, psi = self._poses[-1]
+            words += [f"the car at x {x:.3f} m, y {y:.3f} m, heading {math.degrees(psi):.1f}°"]
+        words += [f"{self.unusable} unusable reports"] if self.unusable else []
+        return ", ".join(words) or "nothing heard of the car"
+
+    def _take_reports(self) -> None:
+        while self._reports:
+            one, arrived_ns = self._reports.popleft()
+            values = dict(one.values)
+            numbers = [one.clock_s or 0.0, *(x for pair in values.values() for x in pair)]
+            try:
+                if not all(map(math.isfinite, numbers)):
+                    raise ValueError("not finite")
+                found = msgspec.convert({"instrument": one.instrument, "time_s": 0.0,
+                                         "values": values}, Reading)  # fmt: skip
+            except (ValueError, TypeError):
+                self.unusable += 1
+                continue
+            delay_s = self._delays_s.get(one.instrument, 0.0)
+            known = self._instruments.setdefault(one.instrument, _Instrument(delay_s))
+            measured_ns = known.measured_ns(one.clock_s, arrived_ns)
+            if set(_POSE) <= values.keys():
+                self._posed_ns = arrived_ns
+                self._poses.append((measured_ns * 1e-9, *(values[name][0] for name in _POSE)))
+            if self._zero_ns is not None:
+                time_s = (measured_ns - self._zero_ns) * 1e-9
+                self._pending.append(msgspec.structs.replace(found, time_s=time_s))
+
+    def _guess(self) -> None:
+        """``x`` but for the steering angle."""
+        if len(self._poses) < _POSES:
+            return
+        poses = np.array(self._poses)
+        poses[:, 3] = np.unwrap(poses[:, 3])
+        first, last = np.median(poses[:_EACH], axis=0), np.median(poses[-_EACH:], axis=0)
+        self.x[:3] = last[1:]
+        moved = (last[1:3] - first[1:3]) @ (np.cos(last[3]), np.sin(last[3]))
+        self.x[3] = moved / max(last[0] - first[0], 1e-3)
+
+    # What it is told ---------------------------------------------------------------------------
+
+    def actuate(self, u: Command) -> None:
+        """A command that acts from now on, its steering rate for a period if no other comes."""
+        now_s, here = time.monotonic(), self.x.copy()
+        self._count(now_s)
+        here[6] = self._angle(now_s)
+        self._d, rate = self.guard.apply(u, here, self.step_s)
+        self._ramp = now_s, float(here[6]), rate
+        try:
+            self.send(self._d, float(here[6]) + rate * self.step_s, abs(rate))
+            self._fault = ""
+        except OSError as error:
+            self._fault = str(error)
+
+    def _angle(self, now_s: float) -> float:
+        """Steering angle as commanded: it keeps turning for a period and no longer."""
+        since_s, delta_rad, rate = self._ramp
+        return delta_rad + rate * min(now_s - since_s, self.step_s)
+
+    def _count(self, now_s: float) -> None:
+        self._acted += self._d * (now_s - self._counted_s)
+        self._counted_s = now_s
+
+    # As the plant has it -----------------------------------------------------------------------
+
+    def begins(self, zero_ns: int) -> None:
+        """Plant time 0 is at this moment of the monotonic clock."""
+        self._zero_ns = zero_ns
+        self._begun_s = self._counted_s = time.monotonic()
+        self._acted = 0.0
+
+    def step_switched(self, commands: object) -> None:
+        """A period is over, in which these acted: :meth:`actuate` has taken them."""
+        now_s = time.monotonic()
+        self._count(now_s)
+        delta = self._angle(now_s)
+        d = self._acted / max(now_s - self._begun_s, 1e-6)
+        self.u_applied = d, (delta - float(self.x[6])) / self.step_s
+        self._begun_s, self._acted = now_s, 0.0
+        self.x[6] = delta
+        self.steps += 1
+        self._take_reports()
+        self._guess()
+
+    def _hold(self, u: Command, count: int) -> tuple[float, float]:
+        raise NotImplementedError("a real car does not wait for its periods")
+
+    def _place(self, start: Floats) -> None:
+        """Whether it stands there; InputError if it does not."""
+        self._zero_ns = None
+        self._pending.clear()
+        self._take_reports()
+        if self.silent or len(self._poses) < _POSES:
+            raise InputError(self.silent or "too few poses of the car so far; start once more")
+        self._guess()
+        ahead, aside = np.array(
+            [[np.cos(start[2]), np.sin(start[2])], [-np.sin(start[2]), np.cos(start[2])]]
+        ) @ (self.x[:2] - start[:2])
+        turned = math.remainder(float(self.x[2] - start[2]), 2 * math.pi)
+        low, high, beside = (self.car.wheelbase_m * one for one in (*_AHEAD, _ASIDE))
+        if not (low <= ahead <= high and abs(aside) <= beside and abs(turned) <= _TURNED_RAD):
+            raise InputError(
+                f"the car is {ahead:.2f} m past the start line's point, {aside:.2f} m to its left, "
+                f"turned by {math.degrees(turned):.0f}°: put it {low:.2f} to {high:.2f} m past it, "
+                "in the direction of driving"
+            )
+        self.x[3:] = 0.0
+        self._d, self._ramp = 0.0, (time.monotonic(), 0.0, 0.0)
