@@ -35,6 +35,8 @@ _POSES: Final = 12
 """Newest poses, by which the speed is known ..."""
 _EACH: Final = 3
 """... and how many of them are one point: their median is no outlier."""
+_SENT: Final = 100
+"""Commands by which is known what has acted."""
 _AHEAD: Final = (0.1, 10.0)
 """Wheelbases by which a car stands past the start line when a run begins ..."""
 _ASIDE: Final = 5.0
@@ -97,11 +99,14 @@ class Hardware(Vehicle):
         car: CarParameters,
         rate_hz: float = 50.0,
         delays_s: Mapping[str, float] | None = None,
+        command_s: float = 0.0,
         silent_s: float = 0.5,
     ) -> None:
         """``rate_hz``: of the states. ``delays_s``: by instrument, the least time from measuring to
-        arrival. ``silent_s``: after so long without a pose the car is stopped, the run over."""
+        arrival. ``command_s``: from sending a command to its acting. ``silent_s``: after so long
+        without a pose the car is stopped, the run over."""
         super().__init__(car, 1 / rate_hz, max(round(PLANT_SUBSTEP_HZ / rate_hz), 1))
+        self.command_s = command_s
         self._delays_s, self._silent_ns = delays_s or {}, round(silent_s * 1e9)
         self._reports: deque[tuple[Report, int]] = deque(maxlen=1000)
         self._pending: deque[Reading] = deque(maxlen=_MOST)
@@ -112,9 +117,9 @@ class Hardware(Vehicle):
         self.unusable = 0
         """Reports that are no measurement."""
         self._fault = ""
-        self._begun_s = self._counted_s = time.monotonic()
-        self._d = self._acted = 0.0
-        self._ramp = self._begun_s, 0.0, 0.0
+        self._until_s = 0.0
+        self._sent: deque[tuple[float, float, float, float]] = deque(maxlen=_SENT)
+        """Since when which command: drive command, steering angle then, steering rate."""
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._listen, name="instruments", daemon=True)
 
@@ -208,42 +213,40 @@ class Hardware(Vehicle):
     def actuate(self, u: Command) -> None:
         """A command that acts from now on, its steering rate for a period if no other comes."""
         now_s, here = time.monotonic(), self.x.copy()
-        self._count(now_s)
-        here[6] = self._angle(now_s)
-        self._d, rate = self.guard.apply(u, here, self.step_s)
-        self._ramp = now_s, float(here[6]), rate
+        _, here[6] = self._wanted(now_s)
+        d, rate = self.guard.apply(u, here, self.step_s)
+        delta_rad = float(here[6])
+        self._sent.append((now_s, d, delta_rad, rate))
         try:
-            self.send(self._d, float(here[6]) + rate * self.step_s, abs(rate))
+            self.send(d, delta_rad + rate * self.step_s, abs(rate))
             self._fault = ""
         except OSError as error:
             self._fault = str(error)
 
-    def _angle(self, now_s: float) -> float:
-        """Steering angle as commanded: it keeps turning for a period and no longer."""
-        since_s, delta_rad, rate = self._ramp
-        return delta_rad + rate * min(now_s - since_s, self.step_s)
-
-    def _count(self, now_s: float) -> None:
-        self._acted += self._d * (now_s - self._counted_s)
-        self._counted_s = now_s
+    def _wanted(self, at_s: float) -> tuple[float, float]:
+        """Drive command and steering angle as they were sent by then."""
+        since_s, d, delta_rad, rate = next(
+            (one for one in reversed(self._sent) if one[0] <= at_s), self._sent[0]
+        )
+        return d, delta_rad + rate * min(max(at_s - since_s, 0.0), self.step_s)
 
     # As the plant has it -----------------------------------------------------------------------
 
     def begins(self, zero_ns: int) -> None:
         """Plant time 0 is at this moment of the monotonic clock."""
-        self._zero_ns = zero_ns
-        self._begun_s = self._counted_s = time.monotonic()
-        self._acted = 0.0
+        self._zero_ns, self._until_s = zero_ns, time.monotonic() - self.command_s
 
     def step_switched(self, commands: object) -> None:
         """A period is over, in which these acted: :meth:`actuate` has taken them."""
-        now_s = time.monotonic()
-        self._count(now_s)
-        delta = self._angle(now_s)
-        d = self._acted / max(now_s - self._begun_s, 1e-6)
-        self.u_applied = d, (delta - float(self.x[6])) / self.step_s
-        self._begun_s, self._acted = now_s, 0.0
-        self.x[6] = delta
+        until_s = time.monotonic() - self.command_s
+        moments = np.linspace(self._until_s, until_s, self.substeps + 1)[1:].tolist()
+        acted = [self._wanted(one) for one in moments]
+        delta_rad = acted[-1][1]
+        self.u_applied = (
+            sum(d for d, _ in acted) / len(acted),
+            (delta_rad - float(self.x[6])) / self.step_s,
+        )
+        self.x[6], self._until_s = delta_rad, until_s
         self.steps += 1
         self._take_reports()
         self._guess()
@@ -271,4 +274,5 @@ class Hardware(Vehicle):
                 "in the direction of driving"
             )
         self.x[3:] = 0.0
-        self._d, self._ramp = 0.0, (time.monotonic(), 0.0, 0.0)
+        self._sent.clear()
+        self._sent.append((time.monotonic(), 0.0, 0.0, 0.0))

@@ -105,6 +105,7 @@ class Run:
         self._over: End | None = None
         """Why a real car is being stopped."""
         self._hardware = self.simulator if isinstance(self.simulator, Hardware) else None
+        self._late_s = 0.0 if self._hardware is None else self._hardware.command_s
 
     @property
     def laps(self) -> int:
@@ -326,7 +327,7 @@ class Run:
             self._interval_s = min(new.decided_at_s - before_s, _LONGEST_S)
             self._held, done = new, at
             self._held_since_s = simulator.time_s + at * substep_ns * 1e-9
-            acting_s = self._held_since_s - new.decided_at_s
+            acting_s = self._held_since_s - new.decided_at_s + self._late_s
             delays += (float(new.state_seq), arrival_s, acting_s)
         if done < simulator.substeps:
             commands.append((simulator.substeps - done, self._fresh(done)))

@@ -45,7 +45,14 @@ class Bench:
         self._example("mocap_plant", *ports, "--endpoint", plant_at)
         drives = controller or tuple(files.arguments)
         self.processes["controller"] = start(
-            "controller", *drives, "--endpoint", plant_at, "--listen", controller_at
+            "controller",
+            "--car",
+            str(FOLDER / "car.toml"),
+            *drives,
+            "--endpoint",
+            plant_at,
+            "--listen",
+            controller_at,
         )
         self.where = ["--endpoint", plant_at, "--endpoint", controller_at]
         until(lambda: "pose" in self.status(), "the plant to see the car")
@@ -100,7 +107,7 @@ def _off_m(track: Track, x: Floats) -> float:
 
 def test_a_car_that_is_only_seen_laps_and_stands_when_the_run_is_over(bench: Bench) -> None:
     bench.begin()
-    done = finish(bench.drive("--laps", "2", "--max-time", "60"))
+    done = finish(bench.drive("--laps", "2", "--max-time", "30"))
     assert done.returncode == 0, done.stderr
     assert "passed: 2 laps" in done.stdout
     x, track = bench.true_states(), prepared().first.track

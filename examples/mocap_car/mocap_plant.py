@@ -9,6 +9,7 @@ import math
 import socket
 import struct
 import sys
+from pathlib import Path
 
 from bayesrace.errors import InputError
 from bayesrace.plant.hardware import Hardware, Report
@@ -17,17 +18,19 @@ from bayesrace.plant.process_settings import PlantSettings
 from bayesrace.transport import Endpoints
 from bayesrace.vehicles import CarParameters, get_car
 
+HERE = Path(__file__).parent
 POSE = struct.Struct("!4d")  # clock of the cameras [s], x, y [m], heading [rad]
 COMMAND = struct.Struct("!3d")  # drive command, steering angle [rad], to be reached at [rad/s]
 DEVIATION = {"x": 0.0005, "y": 0.0005, "psi": math.radians(0.2)}  # of one pose
 DELAY_S = 0.01  # from the exposure of a picture to the datagram's arrival, at the least
+COMMAND_S = 0.001  # from sending a command to its acting
 
 
 class MocapCar(Hardware):
     """Poses arrive at ``here``; commands go to ``there``."""
 
     def __init__(self, car: CarParameters, here: tuple[str, int], there: tuple[str, int]) -> None:
-        super().__init__(car, delays_s={"pose": DELAY_S})
+        super().__init__(car, delays_s={"pose": DELAY_S}, command_s=COMMAND_S)
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.bind(here)
         self._socket.settimeout(0.1)
@@ -60,7 +63,7 @@ def address(text: str) -> tuple[str, int]:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--car", default="orca", help="built-in car, or its file")
+    parser.add_argument("--car", default=str(HERE / "car.toml"), help="built-in car, or its file")
     parser.add_argument("--poses", type=address, default="127.0.0.1:7500", help="they arrive here")
     parser.add_argument("--commands", type=address, default="127.0.0.1:7501", help="they go there")
     parser.add_argument("--endpoint", default="tcp/127.0.0.1:7447", help="of the controller's link")
