@@ -14,6 +14,7 @@ from typing import Any, Final
 from bayesrace.controller.estimator import MOST_INSTRUMENTS, Belief, Measurement, fill, read
 from bayesrace.controller.interface import Controller, Environment, StepOutput
 from bayesrace.controller.process_settings import ControllerSettings
+from bayesrace.controller.settings import MpcSettings
 from bayesrace.messages import QUANTITIES, SENSOR_FAULTS, BrakingPlan, Reading, State
 from bayesrace.transport import Numbering
 from bayesrace.vehicles.parameters import CarParameters
@@ -107,6 +108,8 @@ class Driver:
         self._decided, self._braking = ffi.new("br_decision *"), ffi.new("br_braking *")
         self._around, self._null = ffi.new("br_environment *"), ffi.NULL
         self._believed, self._instruments = ffi.new("br_belief *"), dict[str, int]()
+        if (nominal := controller.nominal) is not None:  # its steps are not used, its model is
+            nominal.set_values(MpcSettings().parameters(car, nominal.manifest.problem.name))
         estimator = car.tuning.estimator
         self.estimate(*estimator.settings(nominal=controller.nominal is not None))
         self._refused: State | None = None

@@ -63,7 +63,7 @@ def simulate(car: Car, link: socket.socket, to: tuple[str, int], lost: float, ou
     for one in (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1):
         signal.signal(one, on_signal)
     simulator, deviation, start_s = car.simulator, [*DEVIATION.values()], time.monotonic()
-    with out.open("w") as truth:
+    with out.open("w", buffering=1) as truth:
         while not over:
             time.sleep(max(start_s + simulator.time_s - time.monotonic(), 0.0))
             try:
