@@ -31,7 +31,7 @@ class Instruments:
         self._count((newest.epoch, newest.run), newest.time_s)
         said = ", ".join(self._said(name, *counts) for name, counts in self._during.items())
         if belief is None:
-            return f"{said or 'no reading yet'}; where the car is is not known"
+            return f"{said or 'no reading yet'}; no position yet"
         x, y, psi = (math.sqrt(belief.covariance[i, i]) for i in range(3))
         known = f"±{1e3 * math.hypot(x, y):.1f} mm, ±{math.degrees(psi):.2f}°"
         return f"{said}; position and heading {known}"
