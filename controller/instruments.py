@@ -29,12 +29,13 @@ class Instruments:
         if newest is None or not newest.estimated:
             return ""
         self._count((newest.epoch, newest.run), newest.time_s)
-        said = ", ".join(self._said(name, *counts) for name, counts in self._during.items())
+        said = [self._said(name, *counts) for name, counts in self._during.items()]
+        seen = ", ".join(said) or "no instrument counted yet"
         if belief is None:
-            return f"{said or 'no reading yet'}; no position yet"
+            return f"{seen}; no position yet"
         x, y, psi = (math.sqrt(belief.covariance[i, i]) for i in range(3))
         known = f"±{1e3 * math.hypot(x, y):.1f} mm, ±{math.degrees(psi):.2f}°"
-        return f"{said}; position and heading {known}"
+        return f"{seen}; position and heading {known}"
 
     def _count(self, run: tuple[int, int], time_s: float) -> None:
         """Takes what has been counted when a period is over; a run begins with a new one."""

@@ -170,7 +170,8 @@ class Hardware(Vehicle):
         words = [f"{name} {one}" for name, one in sorted(self._instruments.items())]
         if self._poses:
             _, x, y, psi = self._poses[-1]
-            words += [f"the car at x {x:.3f} m, y {y:.3f} m, heading {math.degrees(psi):.1f}°"]
+            turned = math.degrees(math.remainder(psi, 2 * math.pi))
+            words += [f"the car at x {x:.3f} m, y {y:.3f} m, heading {turned:.1f}°"]
         words += [f"{self.unusable} unusable reports"] if self.unusable else []
         return ", ".join(words) or "nothing heard of the car"
 

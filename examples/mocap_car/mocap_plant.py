@@ -5,6 +5,7 @@ yours; runs, guard, braking plan, laps and status are those of every plant.
 """
 
 import argparse
+import logging
 import math
 import socket
 import struct
@@ -68,6 +69,7 @@ if __name__ == "__main__":
     parser.add_argument("--commands", type=address, default="127.0.0.1:7501", help="they go there")
     parser.add_argument("--endpoint", default="tcp/127.0.0.1:7447", help="of the controller's link")
     given = parser.parse_args()
+    logging.basicConfig(level=logging.INFO)
     try:
         settings = PlantSettings(
             car=get_car(given.car), endpoints=Endpoints(listen=(given.endpoint,))
