@@ -205,7 +205,8 @@ class Run:
                 if self._outbox:
                     self._sleep_and_send(self._outbox[-1][0])
                 return end
-            if (end := self._halting(self.beat())) is not None:
+            end = self.beat()
+            if self._over is None and (end := self._halting(end)) is not None:
                 return end
 
     def _finished(self) -> End | None:

@@ -103,17 +103,21 @@ def full(state: State) -> list[Any]:
     return [drive, plan]
 
 
-def run_of(car: Rolling, answer: Callable[[State], list[Any]], **request: Any) -> tuple[Any, End]:
+def run_of(
+    car: Rolling,
+    answer: Callable[[State], list[Any]],
+    beat: Callable[[], End | None] = lambda: None,
+) -> tuple[Controller, End]:
     controller = Controller(answer)
     wanted = blank(
         RunRequest, run=1, lockstep=False, x0=(0.0,) * 7, line_left_m=1.0, line_right_m=1.0,
-        max_time_s=0.3, actuation_timeout_s=0.1, **request,
+        max_time_s=0.3, actuation_timeout_s=0.1,
     )  # fmt: skip
     run = Run(
         request=wanted, simulator=car, inbox=cast(Inbox, controller),
         states=cast(Publisher[State], controller), truths=cast(Publisher[Truth], controller),
         decoder=Decoder(Actuation), counters=RunCounters(), numbering=Numbering(),
-        react=lambda _: None, beat=lambda: None, suspended=lambda _: None,
+        react=lambda _: None, beat=beat, suspended=lambda _: None,
         hold=cast(HoldWatch, SimpleNamespace(missing=False)), epoch=7,
     )  # fmt: skip
     return controller, run.execute()
@@ -137,6 +141,19 @@ def test_it_is_seen_in_plant_time_and_driven_at_once(car: Rolling) -> None:
     assert car.vx_mps == 0
     assert car.sent[-1][2] < max(driven)
     assert [state.final for state in states] == [False] * (len(states) - 1) + [True]
+
+
+def test_a_run_that_is_given_up_ends_when_the_car_stands(car: Rolling) -> None:
+    given_up: list[float] = []
+
+    def beat() -> End | None:
+        given_up.append(car.vx_mps)
+        return End("abandoned", "no director") if len(given_up) > 8 else None
+
+    _, end = run_of(car, full, beat)
+    assert end.reason == "abandoned"
+    assert given_up[8] > 0
+    assert car.vx_mps == 0
 
 
 def test_a_command_is_sent_when_it_comes(car: Rolling) -> None:
