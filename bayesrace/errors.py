@@ -112,6 +112,8 @@ def _fields(form: Any, place: Iterable[Any]) -> Mapping[str, Any]:
 
 def _models(form: Any) -> list[Any]:
     """Those that a type is made of."""
+    if root := getattr(form, "model_fields", {}).get("root"):  # a table with any names
+        return _models(root.annotation)
     if hasattr(form, "model_fields"):
         return [form]
     return [model for one in get_args(form) for model in _models(one)]

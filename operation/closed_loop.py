@@ -42,12 +42,12 @@ from bayesrace.messages import (
 )
 from bayesrace.operation.analysis.laps import LapTimes, Trajectory, time_laps
 from bayesrace.operation.drive import RunPlan, announcement, run_request
-from bayesrace.plant.car import CarRun, End, Sensors, drive_lockstep, truth_behind
-from bayesrace.plant.settings import SensorNoise
+from bayesrace.plant.car import CarRun, End, drive_lockstep, truth_behind
 from bayesrace.plant.simulator import Simulator
 from bayesrace.plant.vehicle import Vehicle
 from bayesrace.raceline import RaceLine
 from bayesrace.realtime import uncollected
+from bayesrace.sensors import EXACT, Sensors
 from bayesrace.tracks import PathProjection, Track
 from bayesrace.vehicles import CarParameters
 from bayesrace.vehicles.models import dynamic
@@ -167,23 +167,21 @@ class ClosedLoop:
         vehicle: Vehicle | None = None,
         log: LogWriter | None = None,
         settings: ControllerSettings | None = None,
-        noise: SensorNoise | None = None,
+        sensors: Sensors = EXACT,
         seed: int = 0,
         delay_s: float = 0.0,
     ) -> None:
         """``vehicle``: what plays the car; the built-in equations without. ``log``: gets the
         messages that a race records. ``settings``: of the controller process, as far as they
-        concern lockstep; by default a tolerance that fits the noise. ``noise`` of the sensors with
-        its ``seed``, and ``delay_s`` of states and of actuations each: those of the plant process.
+        concern lockstep. ``sensors`` with the ``seed`` of their errors, and ``delay_s`` of states
+        and of actuations each: those of the plant process.
         """
         self._car, self._track, self._line = car, track, line
         self._vehicle = vehicle or built_in_car(car)
-        tolerance = car.tuning.monitor.tolerance_for((noise or SensorNoise()).deviations)
-        settings = settings or ControllerSettings(car=car, sensor_tolerance=tolerance)
-        self._cycle = Cycle(controller, car, settings)
+        self._cycle = Cycle(controller, car, settings or ControllerSettings(car=car))
         self._controller = controller
         self._log = None if log is None else _Messages(log, car.name)
-        self._noise, self._seed, self._delay_s = noise, seed, delay_s
+        self._sensors, self._seed, self._delay_s = sensors, seed, delay_s
         self._run = self._seq = 0
         self._answer = (0.0, 0.0)
 
@@ -209,8 +207,8 @@ class ClosedLoop:
         request = run_request(self._track, plan)
         if x0 is not None:
             request = structs.replace(request, x0=tuple(map(float, x0)))
-        sensors = Sensors(self._noise, self._seed)
-        run = CarRun(request, self._vehicle, _EPOCH, sensors, 2 * self._delay_s)
+        played = self._sensors, 2 * self._delay_s, self._seed
+        run = CarRun(request, self._vehicle, _EPOCH, *played)
         self._states: list[State] = []
         self._true_x: list[tuple[float, ...]] = []
         self._decided: list[tuple[int, int, int]] = []

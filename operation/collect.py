@@ -16,10 +16,10 @@ from bayesrace.controller.pure_pursuit import DrivingStyle, PurePursuit, PurePur
 from bayesrace.controller.python_controller import PythonController
 from bayesrace.log import LogWriter
 from bayesrace.operation.closed_loop import ClosedLoop, Driven, built_in_car
-from bayesrace.plant.settings import SensorNoise
 from bayesrace.plant.vehicle import FmuFault, Vehicle
 from bayesrace.raceline import RaceLine, RaceLineSettings, read_raceline_for
 from bayesrace.raceline.friction import timed_line
+from bayesrace.sensors import EXACT, Sensors
 from bayesrace.tracks import Track, load_track
 from bayesrace.tracks.spline import fit_arc_length
 from bayesrace.vehicles import CarParameters, car_text
@@ -54,13 +54,13 @@ def collect(
     settings: PurePursuitSettings,
     start_speed_mps: float = 0.1,
     vehicle: Vehicle | None = None,
-    noise: SensorNoise | None = None,
+    sensors: Sensors = EXACT,
     delay_s: float = 0.0,
 ) -> Driven:
     """Drives for ``duration_s`` and logs the run at ``path``: the first that stays on the track, or
     the slowest. With a ``speed_scale`` in ``settings`` there is but one.
 
-    ``noise``, ``delay_s``: as in :class:`ClosedLoop`, the seed is that of ``settings``.
+    ``sensors``, ``delay_s``: as in :class:`ClosedLoop`, the seed is that of ``settings``.
 
     The same settings give the same drive to the bit. ``artefact``: a controller built for the car,
     whose control cycle drives. ``vehicle``: what simulates the car; the built-in equations without.
@@ -78,7 +78,7 @@ def collect(
         try:
             loop = ClosedLoop(
                 car, track, line, PythonController(artefact, pursuit), vehicle, log,
-                noise=noise, seed=settings.seed, delay_s=delay_s,
+                sensors=sensors, seed=settings.seed, delay_s=delay_s,
             )  # fmt: skip
             driven = loop.drive(0, duration_s, start_speed_mps, name="pure-pursuit")
         finally:

@@ -36,6 +36,8 @@ class RunPlan:
     start_speed_mps: float = 0.1
     held: bool = False
     """The car stops unless the director is heard all the time; in real time only."""
+    exact: bool = False
+    """The state is known as it is, whatever the sensors."""
 
 
 def run_request(track: Track, plan: RunPlan) -> RunRequest:
@@ -57,6 +59,7 @@ def run_request(track: Track, plan: RunPlan) -> RunRequest:
         max_time_s=plan.max_time_s,
         actuation_timeout_s=5.0 if plan.lockstep else 0.2,
         held=plan.held,
+        exact=plan.exact,
     )
 
 

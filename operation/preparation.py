@@ -62,7 +62,7 @@ SOURCES: Final = (
 """Our code that shapes a training drive and what is learned from it."""
 
 _SHAPES_A_DRIVE: Final = {
-    "pursuit", "seed", "noise", "delay_s", "start_speed_mps", "true_grip", "simulator",
+    "pursuit", "seed", "delay_s", "start_speed_mps", "true_grip", "simulator",
 }  # fmt: skip
 """Settings, beside the car, its line and how long it is driven."""
 
@@ -212,6 +212,7 @@ def _training_drive(
         *(column.tobytes() for column in (line.s_m, line.x_m, line.y_m, line.vx_mps)),
         car.model_dump_json(),
         settings.model_dump_json(include=_SHAPES_A_DRIVE),
+        settings.instruments.model_dump_json(),
         f"{duration_s!r} {len(files)}",
         *(read_whole(path, "the FMU or its map", _LARGEST_FMU) for path in files),
     )  # fmt: skip
@@ -248,7 +249,7 @@ def drive_for_training(
     with open_vehicle(*simulated_by, simulator=settings.simulator) as vehicle:
         return collect(
             track, line, car, artefact, log, duration_s, pursuit,
-            settings.start_speed_mps, vehicle, settings.noise, settings.delay_s,
+            settings.start_speed_mps, vehicle, settings.instruments, settings.delay_s,
         )  # fmt: skip
 
 

@@ -44,6 +44,7 @@ from bayesrace.operation.terminal.terminal import Stages
 from bayesrace.plant.simulator import PLANT
 from bayesrace.plant.vehicle import FmuFault, open_vehicle
 from bayesrace.recorder import Recorder
+from bayesrace.sensors import write_sensors
 from bayesrace.tracks import load_track
 from bayesrace.transport import RefusedError
 from bayesrace.vehicles import write_car
@@ -60,6 +61,7 @@ _LOWEST: Final = 19
 
 _LOG: Final = "run.mcap"
 _CAR: Final = "car.toml"
+_SENSORS: Final = "sensors.toml"
 _FMU_COPIES: Final = {"fmu": "car.fmu", "fmu_map": "car-map.toml"}
 
 
@@ -219,10 +221,13 @@ def _kept(track: PreparedTrack, out: Path, label: str) -> PreparedTrack:
 def _plant_options(settings: RaceSettings, out: Path) -> list[str]:
     """Of ``bayesrace plant``."""
     files = ("--fmu", settings.fmu), ("--map", settings.fmu_map)
-    noise = [("--noise", f"{name}={value!r}") for name, value in settings.noise if value]
+    sensors = out / _SENSORS
+    if settings.instruments.root:
+        write_sensors(sensors, settings.instruments)
     pairs = [
         ("--car", out / _CAR), ("--simulator", settings.simulator),
-        *(pair for pair in files if pair[1]), *noise,
+        *(pair for pair in files if pair[1]),
+        ("--sensors", sensors if settings.instruments.root else "exact"),
         ("--delay", 1e3 * settings.delay_s), ("--seed", settings.seed),
     ]  # fmt: skip
     return [str(one) for pair in pairs for one in pair]
@@ -258,7 +263,6 @@ class Drives:
             "--car", str(self._out / _CAR), "--artefact", str(artefact),
             "--track", str(track.track_file), "--raceline", str(track.line_file),
             "--settings", str(settings_file),
-            "--sensor-tolerance", str(self._settings.sensor_tolerance),
         ]  # fmt: skip
         if weights is not None:
             options += ["--weights", str(weights)]
@@ -315,7 +319,10 @@ class Drives:
         settings, lockstep = self._settings, self._settings.mode == "lockstep"
         limit_s = settings.limit_s(self._prepared.first.line.lap_time_s)
         start_mps = settings.start_speed_mps
-        return RunPlan(self._run, controller, settings.laps, limit_s, lockstep, start_mps)
+        exact = controller == "bestcase"
+        return RunPlan(
+            self._run, controller, settings.laps, limit_s, lockstep, start_mps, exact=exact
+        )
 
     def _drive_with(self, weights: Path, controller: str) -> RunPlan | None:
         """One run with new weights; None, and the reason in the log, if they are refused."""

@@ -40,7 +40,7 @@ class PreparationSettings(CarSimulation):
         0,
         ge=0,
         le=2**32 - 1,
-        description="seed of the training drive, the GP's starts and the sensors' noise",
+        description="seed of the training drive, the GP's starts and the sensors' errors",
     )
     start_speed_mps: float = Field(0.1, ge=0, le=5, description="speed at the start line")
     collect_s: Annotated[float | None, Option("--train-time")] = Field(
@@ -82,11 +82,6 @@ class PreparationSettings(CarSimulation):
         """With the friction that the line is asked for: the controller must assume the same."""
         grip = self.raceline.friction
         return self.car if grip is None else self.car.model_copy(update={"friction": grip})
-
-    @property
-    def sensor_tolerance(self) -> float:
-        """Of the controllers, which know how noisy their sensors are."""
-        return self.car.tuning.monitor.tolerance_for(self.noise.deviations)
 
     @property
     def true_car(self) -> CarParameters:

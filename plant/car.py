@@ -1,4 +1,4 @@
-"""The car of one run, without transport or clock: start, sensors, laps, end; and the loop of a
+"""The car of one run, without transport or clock: start, states, laps, end; and the loop of a
 lockstep run.
 
 The plant process exchanges states for inputs over the network; ``bayesrace.operation.closed_loop``
@@ -12,15 +12,14 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
-import numpy as np
-
-from bayesrace.messages import RunRequest, State, Truth
+from bayesrace.messages import Reading, RunRequest, State, Truth
 from bayesrace.plant.hardware import Hardware
-from bayesrace.plant.settings import SensorNoise
+from bayesrace.plant.sensors import SensorPlayer
 from bayesrace.plant.vehicle import FmuFault, Vehicle
+from bayesrace.sensors import EXACT, Sensors
 from bayesrace.tracks.track import CrossingLine
 
-__all__ = ["CarRun", "End", "LineCounter", "Sensors", "drive_lockstep", "fault_end", "truth_behind"]
+__all__ = ["CarRun", "End", "LineCounter", "drive_lockstep", "fault_end", "truth_behind"]
 
 _WORLD_M: Final = 1e4
 
@@ -50,22 +49,6 @@ def truth_behind(state: State, x: tuple[float, ...]) -> Truth:
         u_applied=state.u_applied,
         lap=state.lap,
     )
-
-
-class Sensors:
-    """What measures one run: the same seed gives each run the same noise."""
-
-    def __init__(self, noise: SensorNoise | None = None, seed: int = 0) -> None:
-        deviations = (noise or SensorNoise()).deviations
-        self._deviations = np.array(deviations) if any(deviations) else None
-        self._random = np.random.default_rng(seed)
-
-    def measure(self, x: tuple[float, ...]) -> tuple[float, ...]:
-        """What the sensors measure of the true state x (7,)."""
-        if self._deviations is not None:
-            noise = self._deviations * self._random.standard_normal(len(x))
-            x = tuple((np.array(x) + noise).tolist())
-        return x
 
 
 class LineCounter:
@@ -102,17 +85,19 @@ class CarRun:
         request: RunRequest,
         vehicle: Vehicle,
         epoch: int,
-        sensors: Sensors | None = None,
+        sensors: Sensors = EXACT,
         delay_s: float = 0.0,
+        seed: int = 0,
     ) -> None:
-        """``epoch``: of the plant, as its states carry it. ``sensors``: exact without.
+        """``epoch``: of the plant, as its states carry it. ``seed``: of what ``sensors`` add.
 
         ``delay_s``: in lockstep, from a state until the input that answers it acts; rounded to
         parts of a period (:attr:`Vehicle.substeps`).
         """
         self.request, self.vehicle = request, vehicle
         self._epoch = epoch
-        self._sensors = sensors or Sensors()
+        exact = request.exact or not sensors.root
+        self._sensors = None if exact else SensorPlayer(sensors, seed)
         self._delay = round(delay_s / vehicle.step_s * vehicle.substeps)
         self._period = 0
         self._sent: deque[tuple[int, int, tuple[float, ...]]] = deque()
@@ -143,17 +128,17 @@ class CarRun:
     def sample(
         self, seq: int, actuation_delays: tuple[float, ...] = (), final: bool = False
     ) -> tuple[State, tuple[float, ...]]:
-        """What the sensors measure now, and the true state (7,); see :func:`truth_behind`."""
+        """What is measured, and the true state (7,); see :func:`truth_behind`."""
         vehicle, request = self.vehicle, self.request
         now_ns, x = time.monotonic_ns(), tuple(vehicle.x.tolist())
-        readings = vehicle.readings() if isinstance(vehicle, Hardware) else None
+        readings = self._readings(x)
         state = State(
             seq=seq,
             source_time_ns=now_ns,
             epoch=self._epoch,
             run=request.run,
             time_s=vehicle.time_s,
-            x=self._sensors.measure(x) if readings is None else (0.0,) * len(x),
+            x=x if readings is None else (0.0,) * len(x),
             u_applied=vehicle.u_applied,
             lap=self._line.crossings,
             lockstep=request.lockstep,
@@ -163,6 +148,12 @@ class CarRun:
             readings=readings or (),
         )
         return state, x
+
+    def _readings(self, x: tuple[float, ...]) -> tuple[Reading, ...] | None:
+        """What instruments report; None: the whole state is measured."""
+        if isinstance(self.vehicle, Hardware):
+            return self.vehicle.readings()
+        return None if self._sensors is None else self._sensors.report(self.vehicle.time_s, x)
 
     def step(self, u: tuple[float, ...], seq: int) -> None:
         """One period of lockstep, from the sample ``seq`` that ``u`` answers. FmuFault."""

@@ -24,7 +24,7 @@ from bayesrace.messages import (
     Scalar,
     Status,
 )
-from bayesrace.plant.car import End, Sensors
+from bayesrace.plant.car import End
 from bayesrace.plant.hardware import Hardware
 from bayesrace.plant.process_settings import PlantSettings
 from bayesrace.plant.run import Run, RunCounters
@@ -175,7 +175,8 @@ class PlantProcess:
                 hold=self._hold,
                 epoch=self._epoch,
                 delay_s=self._settings.delay_s,
-                sensors=Sensors(self._settings.noise, self._settings.seed),
+                sensors=self._settings.instruments,
+                seed=self._settings.seed,
             )
         except (InputError, FmuFault) as error:
             return str(error)

@@ -18,7 +18,7 @@ class PlantSettings(CarSimulation):
         50.0, ge=1, le=500, description="rate of the states [Hz]; their period in lockstep"
     )
     seed: int = Field(
-        0, ge=0, description="seed of the sensors' noise, which is the same in each run"
+        0, ge=0, description="seed of the sensors' errors, which are the same in each run"
     )
     realtime: RealtimeSettings = RealtimeSettings()
     controller_wait_s: float = Field(
@@ -26,3 +26,8 @@ class PlantSettings(CarSimulation):
     )
     hold_to_run: bool = Field(False, description="refuse runs that are not held")
     parent_pid: int | None = Field(None, description="end when this process, the parent, ends")
+
+    @property
+    def states_hz(self) -> float:
+        """Rate of the states."""
+        return self.rate_hz

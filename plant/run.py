@@ -9,10 +9,11 @@ from itertools import chain
 from typing import Final, NamedTuple
 
 from bayesrace.messages import ACTUATION, Actuation, BrakingPlan, Decoder, RunRequest, State, Truth
-from bayesrace.plant.car import CarRun, End, Sensors, drive_lockstep, fault_end, truth_behind
+from bayesrace.plant.car import CarRun, End, drive_lockstep, fault_end, truth_behind
 from bayesrace.plant.hardware import Hardware
 from bayesrace.plant.vehicle import Command, FmuFault, Vehicle, planned_at
 from bayesrace.realtime import SUSPENDED_S, sleep_until_ns
+from bayesrace.sensors import EXACT, Sensors
 from bayesrace.transport import LOCKSTEP_SPIN_S, Inbox, Item, Kind, Numbering, Publisher
 from bayesrace.transport.hold import HOLD_MISSING, HoldWatch
 
@@ -86,11 +87,13 @@ class Run:
     epoch: int
     delay_s: float = 0.0
     """Added to states and to actuations."""
-    sensors: Sensors | None = None
-    """Exact without."""
+    sensors: Sensors = EXACT
+    seed: int = 0
+    """Of what they add."""
 
     def __post_init__(self) -> None:
-        self._car = CarRun(self.request, self.simulator, self.epoch, self.sensors, 2 * self.delay_s)
+        played = self.sensors, 2 * self.delay_s, self.seed
+        self._car = CarRun(self.request, self.simulator, self.epoch, *played)
         self._delay_ns = round(self.delay_s * 1e9)
         # In real time:
         self._outbox: deque[tuple[int, State, tuple[float, ...]]] = deque()

@@ -1,38 +1,18 @@
-"""What is chosen of a simulated car: who simulates it, and how well its sensors measure."""
+"""What is chosen of a simulated car: who simulates it, and what measures it."""
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from bayesrace.defaults import Option
+from bayesrace.sensors import Sensors, SensorsSetting
 from bayesrace.vehicles import CarSetting, default_car
 
-__all__ = ["CarSimulation", "SensorNoise", "SimulatorName"]
+__all__ = ["CarSimulation", "SimulatorName"]
 
 SimulatorName = Literal["equations", "slipx"]
 """What simulates the car where no FMU does."""
-
-
-class SensorNoise(BaseModel):
-    """Standard deviations of the measured state: white, Gaussian, independent."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    position_m: float = Field(0.0, ge=0, le=1, description="noise of x and of y [m]")
-    heading_rad: float = Field(0.0, ge=0, le=1, description="noise of the heading [rad]")
-    speed_mps: float = Field(0.0, ge=0, le=10, description="noise of vx and of vy [m/s]")
-    yaw_rate_radps: float = Field(0.0, ge=0, le=10, description="noise of the yaw rate [rad/s]")
-    steering_rad: float = Field(0.0, ge=0, le=1, description="noise of the steering angle [rad]")
-
-    @property
-    def deviations(self) -> tuple[float, ...]:
-        """Of the state [x, y, psi, vx, vy, omega, delta], shape (7,)."""
-        position, speed = self.position_m, self.speed_mps
-        return (
-            position, position, self.heading_rad, speed, speed, self.yaw_rate_radps,
-            self.steering_rad,
-        )  # fmt: skip
 
 
 class CarSimulation(BaseModel):
@@ -56,6 +36,19 @@ class CarSimulation(BaseModel):
     delay_s: Annotated[float, Option(unit="ms", per_unit=1000)] = Field(
         0.0, ge=0, le=1, description="delay put on states and on actuations each"
     )
-    noise: Annotated[SensorNoise, Option(metavar="NAME=STD")] = Field(
-        SensorNoise(), description="standard deviation of a sensor; empty: exact"
-    )
+    sensors: SensorsSetting = None
+
+    @property
+    def states_hz(self) -> float:
+        """Rate of the states."""
+        return 50.0
+
+    @property
+    def instruments(self) -> Sensors:
+        """Those chosen, or the car's own."""
+        return self.car.sensors if self.sensors is None else self.sensors
+
+    @model_validator(mode="after")
+    def _readings_fit(self) -> Self:
+        self.instruments.check_rate(self.states_hz)
+        return self

@@ -60,6 +60,7 @@ def read(tmp_path: Path, weights: GpWeights) -> Read:
         ("draws = 9", ("draws = 9", "add [random]")),
         ("[grid]\npoint = 3", ("grid.point = 3 is no setting", "points")),
         ("[grid]\nmode = 'realtime'", ("grid.mode", "no setting that can vary")),
+        ("[grid]\nsensors = ['exact', 'eyes']", ("grid.sensors", "unknown 'eyes'", "mocap")),
         ("[grid]\npoints = [400, 5]", ("grid.points = 5", "greater than or equal to 20")),
         ("[grid]\nmpc.margin_m = -1", ("grid.mpc.margin_m = -1", "track edges")),
         ("[grid]\nmpc.margin = 1", ("grid.mpc.margin = 1", "mpc.margin_m")),
@@ -163,7 +164,7 @@ def test_a_key_changes_with_all_that_shapes_a_row(
 def test_every_factor_does_something(car: CarParameters, tmp_path: Path) -> None:
     """What a plan may name reaches the car, the controllers or the training."""
     names = set(factors())
-    assert names >= {"delay_s", "noise.position_m"}
+    assert names >= {"delay_s", "sensors"}
     assert names >= {"true_grip", "horizon", "points", "kernels", "raceline.friction", "seed"}
     settings = RaceSettings(true_grip=0.5)
     tyres, true = car.tyres, settings.true_car.tyres

@@ -17,11 +17,11 @@ from bayesrace.messages import ACTUATION, EVENT, STATE, TELEMETRY, TRUTH, Event,
 from bayesrace.operation.closed_loop import ClosedLoop
 from bayesrace.operation.collect import collect
 from bayesrace.operation.drive import RunPlan, execute
-from bayesrace.plant.settings import SensorNoise
 from bayesrace.plant.simulator import Simulator
 from bayesrace.plant.vehicle import Command, FmuFault
 from bayesrace.raceline import read_raceline
 from bayesrace.recorder import Recorder
+from bayesrace.sensors import get_sensors
 from bayesrace.tracks import load_track
 from bayesrace.transport import Director, Endpoints, Publisher, free_endpoint, open_session
 from bayesrace.vehicles import CarParameters
@@ -75,19 +75,16 @@ def assert_played_as_driven(log: Path, begin_ns: int) -> None:
         assert begin_ns < entry.wall_ns < time.time_ns()
 
 
-NOISE = ("--noise", "position_m=0.002", "--noise", "speed_mps=0.02", "--seed", "3")
-
-
 @pytest.mark.parametrize(
     ("options", "disturbances"),
     [
         ((), {}),
         (
-            ("--delay", "7", *NOISE),
-            {"delay_s": 0.007, "seed": 3, "noise": SensorNoise(position_m=0.002, speed_mps=0.02)},
+            ("--delay", "7", "--sensors", "odometry", "--seed", "3"),
+            {"delay_s": 0.007, "seed": 3, "sensors": get_sensors("odometry")},
         ),
     ],
-    ids=["exact", "noise and delay"],
+    ids=["exact", "instruments and delay"],
 )
 def test_a_run_is_that_of_two_processes_over_zenoh_to_the_bit(
     tmp_path: Path, car: CarParameters, options: tuple[str, ...], disturbances: dict[str, Any]
@@ -128,9 +125,10 @@ def test_a_run_is_that_of_two_processes_over_zenoh_to_the_bit(
     assert first.x[:, 3].max() > 1.8
     assert second.x.shape == (51, 7)
     assert second.u.shape == (*second.levels.shape, 2) == (50, 2)
-    assert not second.statuses.any()
+    assert not second.statuses[5:].any()  # until then there may be no pose
     measured = np.array([state.x for state in second.states])
     assert np.array_equal(measured, second.x) == (not disturbances)
+    assert any(state.readings for state in second.states) == bool(disturbances)
     truth = LogReader(tmp_path / "own.mcap").select(TRUTH)
     assert len(truth) == len(LogReader(tmp_path / "own.mcap").select(STATE))
     for run, one in enumerate(driven, 1):

@@ -18,6 +18,7 @@ from bayesrace.errors import InputError
 from bayesrace.operation.cli.app import app
 from bayesrace.operation.settings import RaceSettings
 from bayesrace.operation.system import CONFIGURATION, started_system
+from bayesrace.sensors import EXACT, get_sensors
 from bayesrace.transport import (
     Credentials,
     Endpoints,
@@ -275,9 +276,10 @@ def test_a_race_repeats_the_settings_of_another(
     monkeypatch.setattr("bayesrace.operation.race.race", record)
     first = ("--laps", "5", "--seed", "3", "--style", "calm", "--no-constraints", "--delay", "20")
     line = ("--raceline", "line.csv", "--car", "f1tenth")
-    cli("race", *first, *line, "--track", "paddock", "--noise", "speed_mps=0.5")
+    cli("race", *first, *line, "--track", "paddock", "--sensors", "mocap")
     assert seen[0].line == Path("line.csv")
-    assert (seen[0].delay_s, seen[0].mpc.constraints, seen[0].noise.speed_mps) == (0.02, False, 0.5)
+    assert (seen[0].delay_s, seen[0].mpc.constraints) == (0.02, False)
+    assert seen[0].instruments == get_sensors("mocap") != EXACT
     path = tmp_path / "settings.json"
     path.write_text(seen[0].model_dump_json())
     cli("race", "--settings", path)

@@ -1,4 +1,4 @@
-"""Noise of the sensors, and delays in lockstep: what acts when, and how the controller copes."""
+"""Delays in lockstep: what acts when, and how the controller copes."""
 
 from pathlib import Path
 from typing import Any
@@ -12,32 +12,14 @@ from bayesrace.controller.settings import CompensationSettings, MpcSettings
 from bayesrace.gp.weights import GpWeights
 from bayesrace.messages import RunRequest
 from bayesrace.operation.closed_loop import ClosedLoop, Driven
-from bayesrace.plant.car import CarRun, Sensors
-from bayesrace.plant.settings import SensorNoise
+from bayesrace.plant.car import CarRun
 from bayesrace.plant.simulator import Simulator
 from bayesrace.vehicles import CarParameters
 from bayesrace.vehicles.models import dynamic
-from tests.command_line import Cli, refused
 from tests.conftest import Circuit
 from tests.driven import blank
 
 START = (0.0, 0.0, 0.3, 1.0, 0.0, 0.0, 0.05)
-
-
-def measured(noise: SensorNoise, seed: int, count: int = 2000) -> Any:
-    """What the sensors add to one truth, (count, 7)."""
-    sensors = Sensors(noise, seed)
-    return np.array([sensors.measure(START) for _ in range(count)]) - START
-
-
-def test_noise_has_the_deviations_that_are_asked_for_and_is_the_seeds() -> None:
-    noise = SensorNoise(position_m=0.01, heading_rad=0.02, yaw_rate_radps=0.3)
-    added = measured(noise, 1)
-    np.testing.assert_allclose(added.std(axis=0), noise.deviations, rtol=0.1)
-    assert abs(np.corrcoef(added[:, 0], added[:, 1])[0, 1]) < 0.1
-    assert np.array_equal(added, measured(noise, 1))
-    assert not np.array_equal(added, measured(noise, 2))
-    assert not measured(SensorNoise(), 1).any()
 
 
 @pytest.mark.parametrize("delay_ms", [3, 20, 47])
@@ -89,9 +71,3 @@ def test_a_delay_is_measured_and_compensated_in_lockstep_too(
     assert late.laps_s[0] == pytest.approx(lap_s, abs=0.1)
     assert fixed.laps_s[0] == pytest.approx(lap_s, abs=0.1)
     assert not ignored.laps_s or ignored.laps_s[0] > 1.2 * lap_s
-
-
-def test_noise_that_cannot_be_is_refused(cli: Cli) -> None:
-    refused(cli("race", "--noise", "speed=1"), "--noise", "speed", "speed_mps")
-    refused(cli("plant", "--noise", "speed_mps=-1"), "--noise", "speed_mps", "greater than")
-    refused(cli("race", "--noise", "speed_mps"), "--noise", "speed_mps", "NAME=STD")

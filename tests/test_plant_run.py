@@ -128,6 +128,7 @@ def run_with(
         max_time_s=0.3,
         actuation_timeout_s=0.1,
         held=True,
+        exact=False,
     )
     run = Run(
         request=request, simulator=simulator, inbox=cast(Inbox, controller),

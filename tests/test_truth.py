@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from msgspec.structs import replace as changed
 
 from bayesrace.controller.pure_pursuit import PurePursuit, PurePursuitSettings
 from bayesrace.controller.python_controller import PythonController
@@ -15,12 +16,12 @@ from bayesrace.integrators import PREDICTION
 from bayesrace.learning.sources import dataset_from_log
 from bayesrace.learning.validation import identity
 from bayesrace.log import LogReader, LogWriter
-from bayesrace.messages import STATE, TRUTH
+from bayesrace.messages import STATE, TRUTH, State
 from bayesrace.operation.analysis.race import read_race
 from bayesrace.operation.analysis.results import RaceResult
 from bayesrace.operation.analysis.validation import validate_weights
 from bayesrace.operation.closed_loop import ClosedLoop, Driven
-from bayesrace.plant.car import Sensors
+from bayesrace.plant.car import CarRun
 from bayesrace.vehicles import CarParameters
 from bayesrace.vehicles.models import dynamic
 from tests.conftest import Circuit
@@ -30,13 +31,14 @@ from tests.synthetic_race import LAP_S, Drive, analyse, circle, write_race
 ERROR = np.array([0.0, 0.0, 0.0, 0.0, 0.1, 0.2, 0.0])
 """Of vy and omega, which :class:`Spy` does not look at: the car drives on as it did."""
 CALM = PurePursuitSettings(style="calm")
-exactly = Sensors.measure
+exactly = CarRun.sample
 TWO_LAPS = np.array([2 * np.pi * k * STEP_S / LAP_S for k in range(137)])
 
 
-def erring(_: Sensors, x: tuple[float, ...]) -> tuple[float, ...]:
+def erring(run: CarRun, *given: Any, **named: Any) -> tuple[State, tuple[float, ...]]:
     """Adds :data:`ERROR`."""
-    return tuple((np.array(exactly(Sensors(), x)) + ERROR).tolist())
+    state, x = exactly(run, *given, **named)
+    return changed(state, x=tuple((np.array(x) + ERROR).tolist())), x
 
 
 class Spy(PurePursuit):
@@ -76,7 +78,7 @@ def test_a_sensor_that_errs_misleads_the_controller_and_learning_alone(
 ) -> None:
     exact, spy = drives(tmp_path / "exact.mcap")
     assert np.array_equal(exact.x[:-1], spy.given)
-    monkeypatch.setattr(Sensors, "measure", erring)
+    monkeypatch.setattr(CarRun, "sample", erring)
     erred, spy = drives(tmp_path / "erred.mcap")
     # The car, its laps and its excursions are the same, and so is the end by the plant's count.
     assert np.array_equal(erred.x, exact.x)

@@ -331,7 +331,7 @@ class Hold(Message, frozen=True, kw_only=True):
     """Of the run, as in its states."""
 
 
-class RunRequest(Message, frozen=True, kw_only=True, tag=2):
+class RunRequest(Message, frozen=True, kw_only=True, tag=3):
     """Request on ``bayesrace/{car}/plant/run`` to start a run; the answer is a :class:`Reply`."""
 
     run: Count
@@ -354,6 +354,9 @@ class RunRequest(Message, frozen=True, kw_only=True, tag=2):
     its newest actuation is older."""
     held: bool
     """In real time: the car stops when the director's :class:`Hold` is missing."""
+    exact: bool
+    """States of a simulated car are measured as a whole, as BestCase knows them, whatever its
+    sensors."""
 
 
 class StopRequest(Message, frozen=True, kw_only=True):

@@ -6,8 +6,8 @@ the e-kinematic model and the racing line read the former only, the dynamic mode
 that is not simulated needs no more than the former.
 
 A car is a TOML file. Its sections are those of :data:`SECTIONS`, besides ``[tyres]`` and
-``[drive]``, whose ``model`` says which values they hold (:mod:`.parts`), and ``[tuning.*]``, which
-a car needs none of. Numbers are in SI units.
+``[drive]``, whose ``model`` says which values they hold (:mod:`.parts`), ``[sensors.*]``
+(:mod:`bayesrace.sensors`), and ``[tuning.*]``, which a car needs none of. Numbers are in SI units.
 """
 
 import hashlib
@@ -31,6 +31,7 @@ from pydantic_core import to_json
 from bayesrace.defaults import DEFAULT_CAR, Option
 from bayesrace.errors import InputError, faults_in
 from bayesrace.files import parse_toml, read_text, write_whole
+from bayesrace.sensors import EXACT, Sensors, sensor_lines
 from bayesrace.vehicles.parts import (
     GRAVITY_MPS2,
     AccelerationDrive,
@@ -132,6 +133,7 @@ class CarParameters(Part):
     race_track: str = Field(
         "harbour", min_length=1, description="track of races where none is named [-]"
     )
+    sensors: Sensors = Field(EXACT, description="what measures it; none: exactly, as a whole")
     tuning: Tuning = Field(
         default_factory=dict,
         validate_default=True,
@@ -358,7 +360,7 @@ def _form() -> type[Part]:
     fields: dict[str, Any] = {
         name: (field.annotation, field) for name, field in CarParameters.model_fields.items()
     }
-    form = {name: fields[name] for name in ("name", *MODELS)}
+    form = {name: fields[name] for name in ("name", *MODELS, "sensors")}
     for section, names in SECTIONS.items():
         model = create_model(section, __base__=Part, **{name: fields[name] for name in names})
         form[section] = model, Field({}, validate_default=True)
@@ -388,6 +390,7 @@ def write_car(path: Path | str, car: CarParameters) -> None:
         names = SECTIONS.get(section) or type(part).model_fields
         given = [name for name in names if getattr(part, name) is not None]
         lines += ["", f"[{section}]", *(_line(part, name) for name in given)]
+    lines += sensor_lines(car.sensors)
     write_whole(Path(path), "\n".join(lines) + "\n")
 
 

@@ -11,7 +11,6 @@ reference car has it, and a in m/s^2 for a car whose command is an acceleration:
 the reference car is about its usable acceleration. A new car needs none of them in its file.
 """
 
-from collections.abc import Sequence
 from typing import Any, Final, NamedTuple
 
 from pydantic import Field
@@ -153,19 +152,6 @@ class MonitorTuning(_Section):
     yaw_rate_radps: float = _number(2.5, "change of the yaw rate at once [rad/s]")
     yaw_acceleration_radps2: float = _number(250.0, "largest yaw acceleration [rad/s^2]")
     drift: float = _number(0.06, "error of the prediction of a braking car, per distance [-]")
-
-    def tolerance_for(self, deviations: Sequence[float]) -> float:
-        """The multiple of these bounds that sensors take whose noise has such standard deviations,
-        of the state [x, y, psi, vx, vy, omega, delta]; 1 up to that of motion capture."""
-        x, y, psi, vx, vy, omega, delta = deviations
-        return max(
-            1.0,
-            20 * max(x, y) / self.position_m,
-            13 * psi / self.heading_rad,
-            9 * max(vx, vy) / self.speed_mps,
-            11 * omega / self.yaw_rate_radps,
-            20 * delta / self.steering_rad,
-        )
 
 
 class EstimatorTuning(_Section):

@@ -196,9 +196,6 @@ class _FieldOption:
         if kind is bool and default:
             flag, text, default = flag.replace("--", "--no-"), f"do not {text}", False
             self.value = operator.not_
-        elif "=" in own.metavar:
-            several, text, kind = True, f"{text}: {', '.join(kind.model_fields)}", str
-            self.value = lambda given: _pairs(given, f"{flag}: give {own.metavar}")
         elif hasattr(kind, "model_fields"):
             kind = str
         elif own.unit:
@@ -224,12 +221,6 @@ class _FieldOption:
         kind = kind if kind is bool else listed | None
         self.flag, self.name = flag, "_".join(self.path)
         self.parameter = _keyword(self.name, Annotated[kind, option], None if words else default)
-
-
-def _pairs(given: list[str], remedy: str) -> dict[str, str]:
-    if wrong := [one for one in given if "=" not in one]:
-        raise InputError(f"{remedy}, not {wrong[0]}")
-    return dict(one.split("=", 1) for one in given)
 
 
 class Given(Generic[Settings]):
@@ -263,8 +254,7 @@ class Given(Generic[Settings]):
             inner = content
             for name in option.path[:-1]:
                 inner = inner.setdefault(name, {})
-            value, name = option.value(given), option.path[-1]
-            inner[name] = {**inner.get(name, {}), **value} if isinstance(value, dict) else value
+            inner[option.path[-1]] = option.value(given)
         try:
             return self._model.model_validate({**content, **above})
         except ValidationError as error:

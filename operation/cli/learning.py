@@ -36,7 +36,7 @@ _TIMEOUT: Final = options.value(
 
 @options_of(
     "bayesrace.operation.settings.PreparationSettings",
-    "collect_s=--duration pursuit.style seed fmu fmu_map simulator car",
+    "collect_s=--duration pursuit.style seed fmu fmu_map simulator sensors car",
 )
 def collect(
     settings: "Given[PreparationSettings]",

@@ -32,6 +32,7 @@ from bayesrace.operation.analysis.laps import trajectory_digest
 from bayesrace.operation.closed_loop import ClosedLoop, Driven, built_in_car
 from bayesrace.operation.settings import PreparationSettings, RaceSettings
 from bayesrace.operation.terminal.terminal import stages_on
+from bayesrace.sensors import EXACT
 from bayesrace.vehicles import CarParameters
 
 __all__ = ["CONTROLLERS", "FAILED", "LEARNS_FROM", "PAPER", "Case", "Controller", "Files", "Row"]
@@ -128,6 +129,7 @@ class Case:
         return {
             "key": self.key,
             **values | {"car": settings.car.name, "kernels": "+".join(settings.kernels)},
+            "sensors": settings.instruments.label,
             "car_identity": car_identity(settings.car),
             "settings": settings.model_dump_json(exclude=_LEFT_OUT),
         }
@@ -286,8 +288,8 @@ class _Runs:
         table = _table(*on, car.tuning.path.spacing_m)
         loop = ClosedLoop(
             car, *on, compiled_controller(artefact, car, *on, weights, settings.mpc, table=table),
-            _vehicle(settings.true_car), noise=settings.noise, seed=settings.seed,
-            delay_s=settings.delay_s,
+            _vehicle(settings.true_car), sensors=EXACT if best else settings.instruments,
+            seed=settings.seed, delay_s=settings.delay_s,
         )  # fmt: skip
         limit_s = settings.limit_s(on[1].lap_time_s)
         return loop.drive(settings.laps, limit_s, settings.start_speed_mps, name=controller)

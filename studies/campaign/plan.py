@@ -21,6 +21,7 @@ from bayesrace.errors import InputError, faults_in
 from bayesrace.files import parse_toml, read_text
 from bayesrace.gp.weights import decode_weights
 from bayesrace.operation.settings import RaceSettings
+from bayesrace.sensors import get_sensors
 from bayesrace.studies.campaign.case import (
     CONTROLLERS,
     LEARNS_FROM,
@@ -178,6 +179,8 @@ class _Reader:
         try:
             if name == "car" and isinstance(value, str):
                 return self._car(value)
+            if name == "sensors" and isinstance(value, str):
+                return get_sensors(self._folder / value if value.endswith(".toml") else value)
             if name in ("track", "train_track") and isinstance(value, str):
                 value = self._track(value)
             RaceSettings.model_validate(_nested({name: value}))
