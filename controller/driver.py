@@ -108,10 +108,10 @@ class Driver:
         self._decided, self._braking = ffi.new("br_decision *"), ffi.new("br_braking *")
         self._around, self._null = ffi.new("br_environment *"), ffi.NULL
         self._believed, self._instruments = ffi.new("br_belief *"), dict[str, int]()
-        if (nominal := controller.nominal) is not None:  # its steps are not used, its model is
+        estimator, nominal = car.tuning.estimator, controller.nominal
+        if nominal is not None:  # it knows no car yet
             nominal.set_values(MpcSettings().parameters(car, nominal.manifest.problem.name))
-        estimator = car.tuning.estimator
-        self.estimate(*estimator.settings(nominal=controller.nominal is not None))
+        self.estimate(*estimator.settings(nominal=nominal is not None))
         self._refused: State | None = None
         self.last_error = ""
         """Of the last step that was broken; empty if none was."""

@@ -358,12 +358,19 @@ class NativeProblem:
         return x_next
 
     def propagate(
-        self, x: Floats, u: Floats, duration_s: float, variance: Floats
+        self,
+        x: Floats,
+        u: Floats,
+        duration_s: float,
+        variance: Floats,
+        begin: Floats | None = None,
     ) -> tuple[Floats, Floats, Floats]:
         """State (nx,) after at most a stage with u (nu,) held, its Jacobian (nx, nx) in x, and the
-        covariance (nx, nx) that the residual's ``variance`` (ne,) adds."""
+        covariance (nx, nx) that the residual's ``variance`` (ne,) adds. ``begin`` (nx,): where the
+        stage has begun, if not in x."""
         nx, problem = self._nx, self.manifest.problem
-        given = self._given("x", x, nx), self._given("u", u, self._nu)
+        at = self._given("begin", x if begin is None else begin, nx)
+        given = self._given("x", x, nx), at, self._given("u", u, self._nu)
         known = self._given("variance", variance, problem.outputs)
         made = self._made(nx), self._made(nx, nx), self._made(nx, nx)
         results = (result for _, result in made)

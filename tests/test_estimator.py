@@ -6,19 +6,23 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from msgspec import structs
 
 from bayesrace.arrays import Floats
+from bayesrace.codegen.build import build
+from bayesrace.codegen.settings import BuildSettings
 from bayesrace.controller.estimator import Belief, Estimator, Measurement
 from bayesrace.controller.native_step import NativeStep
-from bayesrace.controller.process_settings import ControllerSettings
 from bayesrace.errors import InputError
 from bayesrace.gp.expression import mean_function
 from bayesrace.gp.weights import GpWeights
 from bayesrace.integrators import PREDICTION
-from bayesrace.messages import Reading, State
 from bayesrace.operation.closed_loop import ClosedLoop
-from bayesrace.vehicles import CarParameters
+from bayesrace.operation.preparation import drive_for_training
+from bayesrace.operation.settings import PreparationSettings
+from bayesrace.raceline import compute_raceline
+from bayesrace.sensors import Sensors, get_sensors
+from bayesrace.tracks import load_track
+from bayesrace.vehicles import CarParameters, get_car
 from bayesrace.vehicles.models import e_kinematic
 from tests.conftest import SETTINGS, Make, smooth_drive
 from tests.racing import Racing, racing
@@ -50,6 +54,8 @@ class Textbook:
     p: Floats
     time_s: float
     squared: list[float] = field(default_factory=list)
+    way: Floats = field(default_factory=lambda: np.zeros(7))
+    """Since the beginning of the period, whose residual counts in all its parts."""
 
     @classmethod
     def begun(cls, step: NativeStep, first: Measurement) -> "Textbook":
@@ -58,11 +64,15 @@ class Textbook:
         return cls(step, np.r_[first.value, np.zeros(6)], p, first.time_s)
 
     def reach(self, time_s: float, u: Floats) -> None:
+        if abs(np.remainder(self.time_s + TS / 2, TS) - TS / 2) < 1e-9:  # a period begins
+            self.way = np.zeros(7)
         left = time_s - self.time_s
         while left > 1e-9:
             h = min(left, TS)
-            f, q = np.eye(9), np.diag(DRIFT**2 * h)
-            self.x[:7], f[:7, :7], added = self.step.propagate(self.x[:7], u, h, VARIANCE)
+            f, q, x = np.eye(9), np.diag(DRIFT**2 * h), self.x[:7].copy()
+            after = self.step.propagate(x, u, h, VARIANCE, x - self.way)
+            self.x[:7], f[:7, :7], added = after
+            self.way = self.way + self.x[:7] - x
             q[:7, :7] += added
             self.p = f @ self.p @ f.T + q
             left -= h
@@ -291,49 +301,47 @@ def test_its_covariance_is_that_of_its_errors_on_a_learned_car(
     assert (rmse < (0.006, 0.01, 0.08)).all()
 
 
-class Seen(ClosedLoop):
-    """A race as its controller sees it through motion capture: all that it gets are poses that come
-    a period late, but in gaps of 100 ms every 2 s, 1 % of them nowhere near."""
-
-    def __init__(self, race: Racing, noise: tuple[float, float], seed: int) -> None:
-        settings = ControllerSettings(car=race.car)
-        super().__init__(race.car, race.track, race.line, race.controller(), settings=settings)
-        self._pose, self._random = noise, np.random.default_rng(seed)
-        driver = self._cycle.driver
-        self._observe = driver.observe
-        driver.observe = self._see  # type: ignore[method-assign]
-
-    def _see(self, state: State) -> bool:
-        random, then, measured = self._random, len(self._true_x) - 2, []
-        if then >= 0 and (TS * then + 1) % 2 > 0.1:
-            pose = of_pose(TS * then, np.array(self._true_x[then]), *self._pose)
-            measured = [noisy(random, pose)]
-            if random.random() < 0.01:
-                off = random.normal(0, 0.3, 3)
-                measured = [measured[0]._replace(value=tuple(measured[0].value + off))]
-        readings = tuple(
-            Reading(
-                instrument="pose",
-                time_s=one.time_s,
-                values=dict(
-                    zip(("x", "y", "psi"), zip(one.value, one.deviation, strict=True), strict=True)
-                ),
-            )
-            for one in measured
-        )
-        return self._observe(
-            structs.replace(state, x=(0.0,) * 7, estimated=True, readings=readings)
-        )
+def motion_capture(mm: float, degrees: float) -> Sensors:
+    """Late poses, with gaps of 100 ms, 1 % of them nowhere near."""
+    position = {"deviation": 1e-3 * mm, "outlier": 0.3}
+    heading = {"deviation": np.deg2rad(degrees), "outlier": 0.3}
+    pose = {
+        "rate_hz": 50, "delay_s": 0.02, "jitter_s": 0.005, "gap_s": 0.1, "gap_every_s": 2,
+        "outliers": 0.01, "x_m": position, "y_m": position, "heading_rad": heading,
+    }  # fmt: skip
+    return Sensors.model_validate({"pose": pose})
 
 
-@pytest.mark.parametrize("noise", [(0.5, 0.2), (1.0, 0.5)])
-def test_a_car_seen_by_motion_capture_laps_as_if_its_state_were_known(
-    noise: tuple[float, float],
-) -> None:
-    """Weights learned from the true states: the first lap loses the wait for the first pose, the
-    flying one 0.15 % at most."""
+@pytest.mark.parametrize(
+    "sensors",
+    [motion_capture(0.5, 0.2), motion_capture(1.0, 0.5), get_sensors("odometry")],
+    ids=["0.5 mm", "1 mm", "odometry"],
+)
+def test_a_car_that_instruments_measure_laps_as_if_its_state_were_known(sensors: Sensors) -> None:
+    """Readings between states, by weights learned from true ones: the first lap loses the wait for
+    the first pose, the flying one 0.15 % at most."""
     race = racing()
-    driven = Seen(race, noise, seed=1).drive()
+    controller = race.controller()
+    driven = ClosedLoop(
+        race.car, race.track, race.line, controller, seed=1, sensors=sensors
+    ).drive()
     assert (driven.off_track_m <= 0).all()
-    assert driven.laps_s[0] == pytest.approx(race.driven.laps_s[0] + TS, abs=0.02)
+    assert driven.laps_s[0] == pytest.approx(race.driven.laps_s[0] + 2 * TS, abs=0.04)
     assert driven.laps_s[1] == pytest.approx(race.driven.laps_s[1], rel=1.5e-3)
+
+
+@pytest.mark.parametrize("name", ["orca", "f1tenth"])
+@pytest.mark.parametrize("noise", [(0.5, 0.2), (1.0, 0.5)])
+def test_a_training_drive_by_motion_capture_stays_on_its_track(
+    name: str, noise: tuple[float, float], tmp_path: Path
+) -> None:
+    """Its estimates are those of the model without weights."""
+    car, sensors = get_car(name), motion_capture(*noise)
+    track = load_track(car.train_track, car.width_m)
+    line = compute_raceline(track, car)
+    settings = PreparationSettings(car=car, sensors=sensors)
+    artefact, _ = build(BuildSettings(car=car))
+    driven = drive_for_training(settings, track, line, car, artefact, tmp_path / "drive.mcap")
+    assert track.project_path(driven.x[:, :2]).off_track_m.max() < 0
+    assert driven.x[:, 3].mean() > 1.5
+    assert np.mean(driven.levels == 0) > 0.9

@@ -172,8 +172,8 @@ class EstimatorTuning(_Section):
     steering_offset_rad: float = _number(0.02, "of the measured steering angle's [rad]", ge=0)
     drift_mps: float = _number(0.005, "walk of the velocities in a second [m/s]")
     drift_radps: float = _number(0.05, "and of the yaw rate [rad/s]")
-    nominal_mps: float = _number(0.5, "walk of the velocities by the model without weights [m/s]")
-    nominal_radps: float = _number(5.0, "and of the yaw rate [rad/s]")
+    nominal_mps: float = _number(3.0, "walk of the velocities by the model without weights [m/s]")
+    nominal_radps: float = _number(40.0, "and of the yaw rate [rad/s]")
     gate: float = _number(
         1.0, "times the squared distance that one of 1,000 exceeds, a reading is refused [-]", ge=0
     )

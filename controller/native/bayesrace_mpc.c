@@ -185,11 +185,13 @@ br_mpc_error br_mpc_predict(const br_mpc *mpc, const double x[BR_NX], const doub
     return mpc ? mpc->code->predict(mpc, x, u, duration_s, x_next) : BR_ERROR_NULL;
 }
 
-br_mpc_error br_mpc_propagate(const br_mpc *mpc, const double x[BR_NX], const double u[BR_NU],
-                              double duration_s, const double variance[BR_NE], double x_next[BR_NX],
+br_mpc_error br_mpc_propagate(const br_mpc *mpc, const double x[BR_NX], const double begin[BR_NX],
+                              const double u[BR_NU], double duration_s,
+                              const double variance[BR_NE], double x_next[BR_NX],
                               double jacobian[BR_NX * BR_NX], double covariance[BR_NX * BR_NX]) {
-    return mpc ? mpc->code->propagate(mpc, x, u, duration_s, variance, x_next, jacobian, covariance)
-               : BR_ERROR_NULL;
+    if (!mpc) return BR_ERROR_NULL;
+    return mpc->code->propagate(mpc, x, begin, u, duration_s, variance, x_next, jacobian,
+                                covariance);
 }
 
 #if BR_HAS_PATH

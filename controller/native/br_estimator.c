@@ -53,13 +53,19 @@ void br_estimator_reset(br_estimator *estimator) {
 
 /* --- between two events --- */
 
-/* x and P after a duration of at most a stage, under u. */
+/* x and P after a duration of at most a stage, under u. The residual is that of where the period
+ * began, by what is believed now: taken anew at each measurement it would run ahead of the car. */
 static br_mpc_error propagate(const br_estimator *estimator, const br_event *by, double duration,
                               br_estimate *b) {
-    double f[BR_NX * BR_NX], q[BR_NX * BR_NX], fp[BR_NX][BR_NB];
+    double f[BR_NX * BR_NX], q[BR_NX * BR_NX], fp[BR_NX][BR_NB], begin[BR_NX], next[BR_NX];
+    for (int i = 0; i < BR_NX; ++i) begin[i] = b->x[i] - b->way[i];
     const br_mpc_error error =
-        br_mpc_propagate(estimator->mpc, b->x, by->u, duration, by->variance, b->x, f, q);
+        br_mpc_propagate(estimator->mpc, b->x, begin, by->u, duration, by->variance, next, f, q);
     if (error) return error;
+    for (int i = 0; i < BR_NX; ++i) {
+        b->way[i] += next[i] - b->x[i];
+        b->x[i] = next[i];
+    }
     for (int i = 0; i < BR_NX; ++i)
         for (int j = 0; j < BR_NB; ++j) {
             fp[i][j] = 0;
@@ -83,8 +89,10 @@ static br_mpc_error propagate(const br_estimator *estimator, const br_event *by,
 static br_mpc_error reach(const br_estimator *estimator, const br_event *by, double duration,
                           br_estimate *b) {
     br_mpc_error error = BR_OK;
-    for (; duration > BR_TS + SAME_S && !error; duration -= BR_TS)
+    for (; duration > BR_TS + SAME_S && !error; duration -= BR_TS) {
         error = propagate(estimator, by, BR_TS, b);
+        memset(b->way, 0, sizeof b->way);
+    }
     return error || duration < SAME_S ? error : propagate(estimator, by, fmin(duration, BR_TS), b);
 }
 
@@ -256,6 +264,7 @@ static int place(br_estimator *estimator, const br_measurement *m) {
     given.time_s =
         fmin(fmax(m->time_s, br_estimator_event(estimator, k - 1)->time_s), given.time_s);
     given.measured = *m;
+    given.judged = 0;
     return insert(estimator, k, &given);
 }
 
@@ -283,8 +292,10 @@ static br_mpc_error redo(br_estimator *estimator, int k) {
         one->after = before->after;
         const br_mpc_error error = reach(estimator, one, one->time_s - before->time_s, &one->after);
         if (error) return error;
-        if (!one->measured.count) continue;
-        count(estimator, one, take(&estimator->settings, &one->measured, &one->after));
+        if (one->measured.count)
+            count(estimator, one, take(&estimator->settings, &one->measured, &one->after));
+        else
+            memset(one->after.way, 0, sizeof one->after.way);
     }
     return BR_OK;
 }

@@ -6,6 +6,7 @@
 
 typedef struct {
     double x[BR_NB], p[BR_NB][BR_NB];
+    double way[BR_NX]; /* how far x has moved since the beginning of its period */
 } br_estimate;
 
 typedef struct {

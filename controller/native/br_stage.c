@@ -208,9 +208,10 @@ br_mpc_error br_predict_by(const br_mpc *mpc, const br_gp *gp, const double x[BR
     return BR_OK;
 }
 
-br_mpc_error br_propagate(const br_mpc *mpc, const double x[BR_NX], const double u[BR_NU],
-                          double duration_s, const double variance[BR_NE], double x_next[BR_NX],
-                          double jacobian[BR_NX * BR_NX], double covariance[BR_NX * BR_NX]) {
+br_mpc_error br_propagate(const br_mpc *mpc, const double x[BR_NX], const double begin[BR_NX],
+                          const double u[BR_NU], double duration_s, const double variance[BR_NE],
+                          double x_next[BR_NX], double jacobian[BR_NX * BR_NX],
+                          double covariance[BR_NX * BR_NX]) {
     if (!x || !u || !x_next || !jacobian || !covariance) return BR_ERROR_NULL;
     if (!mpc->has_parameters) return BR_ERROR_NOT_READY;
     if (!(duration_s > 0 && duration_s <= BR_TS * (1 + PART_MIN))) return BR_ERROR_TIME;
@@ -222,7 +223,7 @@ br_mpc_error br_propagate(const br_mpc *mpc, const double x[BR_NX], const double
     BR_ALIGNED br_gp_row kernels[BR_NE * BR_GP_BLOCKS];
     br_correction residual = {0};
     BR_CALL(br_acting, BR_LIST(x, u, &duration_s, theta), BR_LIST(acting));
-    br_stage_features(x, acting, z[0]);
+    br_stage_features(begin ? begin : x, acting, z[0]);
     if (gp->any) br_gp_evaluate(gp, 1, z, kernels, 1, &residual);
     for (int j = 0; j < BR_NE; ++j) mean[j] = share * residual.mean[j];
     BR_CALL(br_transit, BR_LIST(x, acting, mean, &duration_s), BR_LIST(unlimited, in_w[0]));
