@@ -108,10 +108,11 @@ class Driver:
         self._decided, self._braking = ffi.new("br_decision *"), ffi.new("br_braking *")
         self._around, self._null = ffi.new("br_environment *"), ffi.NULL
         self._believed, self._instruments = ffi.new("br_belief *"), dict[str, int]()
-        estimator, nominal = car.tuning.estimator, controller.nominal
+        self._estimator, nominal = car.tuning.estimator, controller.nominal
         if nominal is not None:  # it knows no car yet
             nominal.set_values(MpcSettings().parameters(car, nominal.manifest.problem.name))
-        self.estimate(*estimator.settings(nominal=nominal is not None))
+        self._by_weights = bool(controller.weights_version)
+        self.estimate(*self._estimator.settings(nominal=not self._by_weights))
         self._refused: State | None = None
         self.last_error = ""
         """Of the last step that was broken; empty if none was."""
@@ -214,6 +215,12 @@ class Driver:
         )
         artefact.check(error, "estimation")
 
+    def _trust_model(self) -> None:
+        """As much as a model with weights, or one without: from one run to the next."""
+        if (by_weights := bool(self.controller.weights_version)) != self._by_weights:
+            self._by_weights = by_weights
+            self.estimate(*self._estimator.settings(nominal=not by_weights))
+
     def _measurement(self, reading: Reading) -> Measurement | None:
         """None: of one instrument too many."""
         number = self._instruments.setdefault(reading.instrument, len(self._instruments))
@@ -250,6 +257,8 @@ class Driver:
     def observe(self, state: State) -> bool:
         """Takes a state that has arrived; False if it is not to be driven on."""
         measured, delays_s = self._measured, state.actuation_delays[2::3]
+        if state.estimated and (self.newest is None or state.run != self.newest.run):
+            self._trust_model()
         measured.epoch, measured.run, measured.seq = state.epoch, state.run, state.seq
         measured.time_s, measured.lockstep = state.time_s, state.lockstep
         measured.x, measured.u_applied = state.x, state.u_applied
