@@ -83,9 +83,11 @@ def weights_file(weights: GpWeights | None, identity: str, capacity: int) -> byt
     return _file(b"BRFMGPWT", body, capacity)
 
 
-def settings_file(values: Mapping[str, float]) -> str:
-    """The file of the settings: parameters of the problem and its solver, and of the cycle."""
-    return "".join(f"{name} {value!r}\n" for name, value in values.items())
+def settings_file(values: Mapping[str, float | tuple[float, ...]]) -> str:
+    """The file of the settings: parameters of the problem and its solver, of the cycle and of the
+    estimator."""
+    rows = {name: v if isinstance(v, tuple) else (v,) for name, v in values.items()}
+    return "".join(f"{name} {' '.join(map(repr, row))}\n" for name, row in rows.items())
 
 
 def export(
@@ -93,7 +95,7 @@ def export(
     manifest: Manifest,
     rows: ArrayLike,
     spacing_m: float,
-    values: Mapping[str, float],
+    values: Mapping[str, float | tuple[float, ...]],
     weights: GpWeights | None,
 ) -> None:
     """Writes all three files for a built controller; arguments as of the functions above."""

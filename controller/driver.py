@@ -168,9 +168,19 @@ class Driver:
     @property
     def fault_text(self) -> str:
         """The same as a sentence."""
-        return self.controller.artefact.text(
-            self._library.br_cycle_fault_text(self._counters.fault)
-        )
+        fault, library = self._counters.fault, self._library
+        if self.newest is None or not self.newest.estimated:
+            return self.controller.artefact.text(library.br_cycle_fault_text(fault))
+        if not self.faulty:
+            return "position and heading are not known well enough"
+        text = self.controller.artefact.text(library.br_instrument_fault_text(fault))
+        return f"instrument '{self.faulty}': {text}"
+
+    @property
+    def faulty(self) -> str:
+        """The instrument that is not believed; empty: each is, or the state is measured."""
+        number = self._counters.instrument
+        return list(self._instruments)[number] if number >= 0 else ""
 
     @property
     def output(self) -> StepOutput | None:

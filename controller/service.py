@@ -24,6 +24,7 @@ from bayesrace.transport.hold import HOLD_MISSING, HoldWatch
 __all__ = ["Service"]
 
 _REMEDY: Final = "the car stops along the line; look at the sensors, then 'bayesrace go'"
+_LEFT_OUT: Final = "the car drives on without it"
 
 
 class Service:
@@ -57,7 +58,7 @@ class Service:
         self._text = "waiting for the plant"
         self._publishing = threading.Lock()
         self._weights_refused = 0
-        self._fault_reported = False
+        self._fault_reported = ("", "")
         self.stopping = False
         """The process has received a signal to end."""
         self.plant_there = True
@@ -85,14 +86,16 @@ class Service:
 
     def report_fault(self) -> None:
         """Publishes that states are not believed any more, or are again."""
-        fault = self._driver.fault
-        if bool(fault) == self._fault_reported:
+        fault, faulty = self._driver.fault, self._driver.faulty
+        before, of = self._fault_reported
+        if bool(fault) == bool(before) and faulty == of:
             return
-        self._fault_reported = bool(fault)
+        self._fault_reported = fault, faulty
         if fault:
-            self.announce("sensor_fault", f"{fault}: {self._driver.fault_text}", {"fault": fault})
+            data = {"fault": fault, "instrument": faulty}
+            self.announce("sensor_fault", f"{fault}: {self._driver.fault_text}", data)
         else:
-            self.announce("sensor_recovered", "the measured states are believed again", {})
+            self.announce("sensor_recovered", "what is measured is believed again", {})
 
     def check_hold(self) -> None:
         """Stops the car of a held run whose director is missing: until ``go``, or another run."""
@@ -157,7 +160,9 @@ class Service:
         if said := self._instruments.words():
             words.append(said)
         if fault := driver.fault:
-            words.append(f"sensor fault '{fault}': {driver.fault_text}; {_REMEDY}")
+            drives = driver.faulty and driver.phase is Phase.DRIVING
+            remedy = _LEFT_OUT if drives else _REMEDY
+            words.append(f"sensor fault '{fault}': {driver.fault_text}; {remedy}")
         failed = driver.count("failed")
         if failed:
             words.append(f"{failed} step(s) failed, the last {driver.last_error}")
@@ -220,5 +225,11 @@ class Service:
             "second_starts": driver.count("second_starts"),
             "cost_jumps": driver.count("cost_jumps"),
             **{f"sensor_{name}": count for name, count in driver.faults.items() if count},
+            **{
+                f"readings_{what}_{name}": count
+                for name, one in driver.instruments.items()
+                for what in ("refused", "lost", "left_out")
+                if (count := getattr(one, what))
+            },
             **(weights.status() if weights else {"weights_refused": self._weights_refused}),
         }

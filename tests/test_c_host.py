@@ -1,11 +1,14 @@
 """A C program hosts the whole controller: to the bit as Python does, and over UDP."""
 
 import contextlib
+import itertools
 import shutil
 import socket
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,16 +24,19 @@ from bayesrace.controller.process_settings import ControllerSettings
 from bayesrace.gp.weights import GpWeights
 from bayesrace.log import LogReader, LogWriter
 from bayesrace.manifest import read_manifest
-from bayesrace.messages import ACTUATION, STATE, TELEMETRY, State
+from bayesrace.messages import ACTUATION, QUANTITIES, STATE, TELEMETRY, State
 from bayesrace.operation.closed_loop import ClosedLoop
 from bayesrace.vehicles import CarParameters
 from tests import sample_messages as messages
 from tests.conftest import SETTINGS, Circuit
+from tests.instruments import Seen, odometry, reading
 from tests.native_programs import SANITIZED, native_program
 from tests.programs import ROOT
 
 SOURCE = ROOT / "examples" / "c_host"
 LAPS = 1
+INSTRUMENTS = ("gyro", "wheel", "pose")
+"""By number, as they come first."""
 
 
 @pytest.fixture(scope="module")
@@ -58,6 +64,7 @@ def data(
     """Racing line, weights and settings."""
     folder = tmp_path_factory.mktemp("data")
     values = SETTINGS.parameters(car) | ControllerSettings().cycle_values(car)
+    values |= car.tuning.estimator.named(nominal=False)
     table = circuit.table
     export(folder, read_manifest(kinematic_artefact), table.rows, table.spacing_m, values, weights)
     return folder
@@ -69,7 +76,20 @@ def line_of(state: State) -> str:
     delays_s = state.actuation_delays[2::3]
     numbers = (state.epoch, state.run, state.seq, state.time_s, *flags, *state.x, *state.u_applied,
                *delays_s)  # fmt: skip
-    return " ".join(map(repr, numbers)) + "\n"
+    line = " ".join(map(repr, numbers))
+    for one in state.readings if state.estimated else ():
+        values = ((QUANTITIES.index(name), *both) for name, both in one.values.items())
+        head = INSTRUMENTS.index(one.instrument), one.time_s
+        line += " ; " + " ".join(map(repr, itertools.chain(head, *values)))
+    return line + (" ;" if state.estimated and not state.readings else "") + "\n"
+
+
+def answers(program: Path, data: Path, states: Iterable[State]) -> list[list[str]]:
+    sent_lines = "".join(map(line_of, states))
+    done = subprocess.run(
+        [program, data], input=sent_lines, capture_output=True, text=True, check=True, timeout=120
+    )
+    return [line.split() for line in done.stdout.splitlines()]
 
 
 def test_a_recorded_drive_is_answered_to_the_bit(
@@ -85,17 +105,30 @@ def test_a_recorded_drive_is_answered_to_the_bit(
     loop.drive(LAPS)
     log.close()
     reader = LogReader(tmp_path / "log.mcap")
-    sent_lines = "".join(line_of(state) for state in reader.select(STATE))
-    done = subprocess.run(
-        [program, data], input=sent_lines, capture_output=True, text=True, check=True, timeout=120
-    )
-    rows = [line.split() for line in done.stdout.splitlines()]
+    rows = answers(program, data, reader.select(STATE))
     actuations, telemetry = reader.select(ACTUATION), reader.select(TELEMETRY)
     assert len(rows) == len(actuations) > 100
     for row, sent, how in zip(rows, actuations, telemetry, strict=True):
         assert tuple(map(int, row[:3])) == (sent.epoch, sent.run, sent.state_seq)
         assert tuple(map(float, row[3:6])) == (sent.decided_at_s, *sent.u)
         assert tuple(map(int, row[6:])) == (sent.status, how.fallback)
+
+
+def test_a_drive_by_readings_is_answered_to_the_bit(
+    program: Path, data: Path, tmp_path: Path, native: NativeStep, circuit: Circuit,
+    car: CarParameters, weights: GpWeights, kinematic_artefact: Path,
+) -> None:  # fmt: skip
+    track, line = circuit.track, circuit.line
+    race: Any = SimpleNamespace(car=car, track=track, line=line)
+    log = LogWriter(tmp_path / "log.mcap")
+    loop = Seen(race, odometry(), controller=PredictiveController(native), log=log)
+    loop.drive(LAPS, max_time_s=6.0)
+    log.close()
+    rows = answers(program, data, loop.seen)
+    sent = LogReader(tmp_path / "log.mcap").select(ACTUATION)
+    assert len(rows) == len(sent) > 100
+    for row, one in zip(rows, sent, strict=True):
+        assert tuple(map(float, row[3:6])) == (one.decided_at_s, *one.u)
 
 
 @pytest.fixture
@@ -168,6 +201,8 @@ def test_over_udp_no_other_sender_ends_the_run_or_takes_its_answers(
         (("r_duty ", "r_duty x"), "settings.txt lacks a number: r_duty"),
         (("stale_s", "# stale_s"), "settings.txt lacks a line: stale_s"),
         (("stale_s ", "stale_s -"), "out of its range"),
+        (("gate ", "# "), "settings.txt lacks a line: gate"),
+        (("drift 0.0 ", "drift "), "settings.txt lacks a number: drift"),
     ],
 )
 def test_unusable_settings_are_named(
@@ -195,15 +230,23 @@ def test_no_sanitizer_finds_anything_whatever_the_states_say(
     random, lines = np.random.default_rng(4), []
     odd = ("nan", "inf", "-inf", "1e300", "-1", "0", "9223372036854775807", "-9223372036854775808")
     x = tuple(map(float, circuit.start(v_mps=1.5)))
+    readings = (
+        reading("pose", 0.0, x=x[0], y=x[1], psi=x[2], deviation=(0.001, 0.001, 0.01)),
+        reading("gyro", 0.02, omega=0.0, deviation=(0.02,)),
+    )
     for k in range(300):
         delays = (0.0, 0.0, 0.02) * int(random.integers(0, 64))
         lockstep = bool(k // 100 % 2)
         sent = messages.state(
             k, time_s=0.02 * k, x=x, lockstep=lockstep, actuation_delays=delays, final=k % 90 == 89
         )
+        if k % 2:
+            sent = replace(sent, estimated=True, readings=readings * int(random.integers(0, 9)))
         words = line_of(sent).split()
         for _ in range(int(random.integers(0, 3)) if k % 3 == 0 else 0):
-            at = random.integers(len(words))
+            at = int(random.choice([i for i, one in enumerate(words) if one != ";"]))
+            if at > 15 and "." not in words[at]:
+                continue  # a state or instrument that is none ends the program
             words[at] = str(random.choice(odd[4:] if at < 3 else odd))  # epoch, run, seq: whole
         lines.append(" ".join(words))
     done = subprocess.run(

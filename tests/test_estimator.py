@@ -230,7 +230,7 @@ def test_what_cannot_be_is_refused_and_counted(make: Make, drive: Drive) -> None
         made.advance(TS * (k + 1), u, VARIANCE, [*drive.measured[k], *bad])
     assert made.read().x == pytest.approx(expected.x, abs=1e-9)
     counts = made.instrument(POSE)
-    assert (counts.used, counts.refused, counts.lost) == (60, 6, 24)
+    assert (counts.used, counts.refused, counts.lost) == (59, 8, 24)  # it moves: two more
     assert counts.refused_in_row == 0
 
 

@@ -190,6 +190,10 @@ class EstimatorTuning(_Section):
         )  # fmt: skip
         return start, (0.0, 0.0, 0.0, walk, walk, turn, 0.0, 0.0, 0.0), self.gate
 
+    def named(self, *, nominal: bool) -> dict[str, Any]:
+        """The same by name."""
+        return dict(zip(("start", "drift", "gate"), self.settings(nominal=nominal), strict=True))
+
 
 class PlausibleTuning(_Section):
     """Largest magnitudes of a state that a controller accepts."""

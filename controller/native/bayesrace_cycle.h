@@ -47,19 +47,6 @@ typedef enum {
     BR_STOP          /* standing still */
 } br_level;
 
-/* Why a measured state is not believed: see br_state.c and br_cycle_fault_text. */
-typedef enum {
-    BR_FAULT_NONE = 0,
-    BR_FAULT_FROZEN,
-    BR_FAULT_TIME,
-    BR_FAULT_POSITION,
-    BR_FAULT_HEADING,
-    BR_FAULT_VELOCITY,
-    BR_FAULT_YAW_RATE,
-    BR_FAULT_STEERING,
-    BR_FAULT_ELSEWHERE
-} br_fault;
-
 /* Life cycle of a controller. */
 typedef enum {
     BR_PHASE_WAITING = 0, /* no state has arrived */
@@ -170,8 +157,10 @@ typedef struct {
     int64_t foreign; /* states of another plant or run, or far ahead, that were not driven on */
     int64_t faults[BR_FAULT_ELSEWHERE + 1]; /* states by what speaks against them */
     int fault;                              /* br_fault of the newest state */
-    int phase;                              /* br_phase, at this moment */
-    double delay_s;                         /* delay that is compensated, at this moment */
+    int instrument; /* whose fault it is, where that is estimated; -1: none's, or nothing is known
+                     */
+    int phase;      /* br_phase, at this moment */
+    double delay_s; /* delay that is compensated, at this moment */
     double interval_s; /* plant time between two states in a row; 0: not known */
 } br_counters;
 
@@ -226,15 +215,17 @@ BR_API br_mpc_error br_cycle_set_estimation(br_cycle *cycle, const br_mpc *model
                                             const br_estimation *settings);
 BR_API const br_estimator *br_cycle_estimator(const br_cycle *cycle);
 
-/* A state has arrived. One that is to be estimated counts with what the estimator makes of it, and
- * is doubted (BR_FAULT_POSITION) while its position is not known to the car's bound; the car is not
- * driven before it has begun. A measured one that contradicts those before it (br_state.c) counts
- * with what the model predicts in place of what it says; after settings.stale_s the car brakes
- * along the line, by that prediction, and drives on once states agree with it again. A run is one
- * stream of states: one plant (epoch), one run number, rising numbers. Another stream is followed
- * once the run has ended (br_cycle_end), once nothing has come for long (br_cycle_forget), or once
- * it has sent several states in a row while the former one was silent: no single message locks out
- * the plant.
+/* A state has arrived. One that is to be estimated counts with what the estimator makes of it,
+ * while faulty instruments are left out and named (counters.instrument). It is doubted while
+ * position or heading are not known to the car's bounds, or no instrument that is believed measures
+ * a position; where that was contradicted until it was unknown, until br_cycle_go, with which the
+ * estimator begins anew. The car is not driven before the estimator has begun. A measured one that
+ * contradicts those before it (br_state.c) counts with what the model predicts in place of what it
+ * says; after settings.stale_s the car brakes along the line, by that prediction, and drives on
+ * once states agree with it again. A run is one stream of states: one plant (epoch), one run
+ * number, rising numbers. Another stream is followed once the run has ended (br_cycle_end), once
+ * nothing has come for long (br_cycle_forget), or once it has sent several states in a row while
+ * the former one was silent: no single message locks out the plant.
  */
 BR_API br_reception br_cycle_observe(br_cycle *cycle, const br_measured *state);
 

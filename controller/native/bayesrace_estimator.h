@@ -27,6 +27,20 @@ extern "C" {
 #define BR_INSTRUMENTS 8
 #define BR_EVENTS 64 /* of the newest periods and measurements that are kept to be done over */
 
+/* Why a measured state, or an instrument, is not believed: see br_state.c, br_instrument.c and
+ * br_cycle_fault_text. */
+typedef enum {
+    BR_FAULT_NONE = 0,
+    BR_FAULT_FROZEN,
+    BR_FAULT_TIME,
+    BR_FAULT_POSITION,
+    BR_FAULT_HEADING,
+    BR_FAULT_VELOCITY,
+    BR_FAULT_YAW_RATE,
+    BR_FAULT_STEERING,
+    BR_FAULT_ELSEWHERE
+} br_fault;
+
 /* What one instrument has measured at one moment. */
 typedef struct {
     double time_s;
@@ -59,10 +73,20 @@ typedef struct {
 typedef struct {
     int64_t used, refused;    /* refused: by the gate */
     int64_t lost;             /* from the future, or from before what is kept */
+    int64_t left_out;         /* equal to the bit though the car moved; agreeing, of a faulty one */
     int refused_in_row;       /* of the newest */
     double squared, expected; /* of those used, at first: sums of the squared distances by the
                                * covariance of what is new in them, and of how many values they
                                * had; equal where all covariances are true */
+    int fault; /* br_fault: it is left out; 0: it is believed. What that follows of: */
+    int bad_in_row, good_in_row;  /* of the newest */
+    int seen;                     /* it has measured since the estimator began */
+    double interval_s;            /* between two measurements; 0: not known yet */
+    double measured_s, arrived_s; /* of the newest; arrived: the end of its period */
+    br_measurement held;          /* the first of those that are equal to the bit, ... */
+    double held_expected[BR_NX];  /* ... and what was expected of it; */
+    double held_moved;            /* by how many deviations that has changed since, at most */
+    int repeated, longest;        /* how often it was repeated since, and others before it */
 } br_instrument;
 
 typedef struct br_estimator br_estimator;
@@ -75,13 +99,17 @@ BR_API br_mpc_error br_estimator_init(void *memory, size_t size, const br_mpc *m
  * anew. */
 BR_API br_mpc_error br_estimator_set(br_estimator *estimator, const br_estimation *settings);
 
-/* Knows nothing any more; counts stay. */
+/* Knows nothing any more, and believes all instruments; counts stay. */
 BR_API void br_estimator_reset(br_estimator *estimator);
 
 /* The period that ends at time_s is over: u acted in it, and so much has been measured, in it or
  * before. variance: of the residual, per stage; NULL: 0. It begins with a position and heading that
- * are measured together. BR_ERROR_NOT_READY while it has not begun; BR_ERROR_TIME if time_s is not
- * after the period before, BR_ERROR_STATE if the model cannot follow: it then begins anew. */
+ * are measured together, and anew after a second without unless they are contradicted. Where what
+ * follows does not fit to a car around standstill, it begins with the difference of two poses. What
+ * contradicts, repeats itself or is of another time five times in a row, or does not come for five
+ * intervals and 0.15 s, is left out until three in a row agree (br_instrument.c).
+ * BR_ERROR_NOT_READY while it has not begun; BR_ERROR_TIME if time_s is not after the period
+ * before, BR_ERROR_STATE if the model cannot follow: it then begins anew. */
 BR_API br_mpc_error br_estimator_advance(br_estimator *estimator, double time_s,
                                          const double u[BR_NU], const double variance[BR_NE],
                                          const br_measurement *measurements, int count);
@@ -90,6 +118,9 @@ BR_API br_mpc_error br_estimator_advance(br_estimator *estimator, double time_s,
 BR_API br_mpc_error br_estimator_read(const br_estimator *estimator, br_belief *belief);
 
 BR_API const br_instrument *br_estimator_instrument(const br_estimator *estimator, int number);
+
+/* What speaks against an instrument, in words. */
+BR_API const char *br_instrument_fault_text(br_fault fault);
 
 #ifdef __cplusplus
 }

@@ -185,6 +185,14 @@ br_mpc_error br_mpc_predict(const br_mpc *mpc, const double x[BR_NX], const doub
     return mpc ? mpc->code->predict(mpc, x, u, duration_s, x_next) : BR_ERROR_NULL;
 }
 
+br_mpc_error br_mpc_set_covariance(br_mpc *mpc, const double covariance[BR_NX * BR_NX]) {
+    if (!mpc || !covariance) return BR_ERROR_NULL;
+    if (!br_all_finite(covariance, BR_NX * BR_NX)) return BR_ERROR_STATE;
+    memcpy(mpc->caution.covariance, covariance, sizeof mpc->caution.covariance);
+    mpc->caution.given = 1;
+    return BR_OK;
+}
+
 br_mpc_error br_mpc_propagate(const br_mpc *mpc, const double x[BR_NX], const double begin[BR_NX],
                               const double u[BR_NU], double duration_s,
                               const double variance[BR_NE], double x_next[BR_NX],

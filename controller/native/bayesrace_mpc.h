@@ -283,6 +283,11 @@ BR_API br_mpc_error br_mpc_observe(br_mpc *mpc, const double x[BR_NX], const dou
                                    double duration_s, const double x_next[BR_NX],
                                    const double noise[BR_NX]);
 
+/* The state of the next step is an estimate with this covariance, row by row. The tube of the step
+ * after it begins with that, which hardly changes from step to step, so that it can be made in the
+ * preparation. To be said before each step; otherwise the state is exact. */
+BR_API br_mpc_error br_mpc_set_covariance(br_mpc *mpc, const double covariance[BR_NX * BR_NX]);
+
 /* The preparation phase of the next step, between two steps: shifts the plan for the elapsed_s
  * that is expected, linearises there, and does what of the QP depends neither on the next state nor
  * on its reference. With budget_s (and a clock) it first solves the next problem as it is foreseen,

@@ -7,12 +7,13 @@
  *
  *   D_j,k+1 = (A_k - B_k K_k) D_j,k + F_k,j sigma_j(z_k),   D_j,0 = 0
  *
- * F_k,j is what the residual's output does to the states. A row h <= upper becomes
- * h + n |D_k' grad h| <= upper with n standard deviations. (Independent errors would add up to the
- * root of the number of stages only, which is far too little: docs/decisions/2026-11-23-caution.md
- * has the laps.) K is the gain of a linear quadratic regulator about the plan; the problem names
- * the sizes of the deviations that it weighs equally. Where the car errs more than sigma says,
- * sigma is widened: see below.
+ * F_k,j is what the residual's output does to the states. An estimated state adds deviations of its
+ * own that begin with the columns of L, L L' = P its covariance, and add nothing on their way. A
+ * row h <= upper becomes h + n |D_k' grad h| <= upper with n standard deviations. (Independent
+ * errors would add up to the root of the number of stages only, which is far too little:
+ * docs/decisions/2026-11-23-caution.md has the laps.) K is the gain of a linear quadratic regulator
+ * about the plan; the problem names the sizes of the deviations that it weighs equally. Where the
+ * car errs more than sigma says, sigma is widened: see below.
  *
  * As in zero-order robust MPC (Zanelli, Frey, Messerer, Diehl, "Zero-order robust nonlinear model
  * predictive control with ellipsoidal uncertainty sets", 2021) all of this belongs to the plan that
@@ -113,8 +114,26 @@ static void standard_deviations(br_mpc *mpc, double sigma[BR_N][BR_NE]) {
 }
 
 void br_caution_reset(br_caution *caution) {
-    caution->active = 0;
+    caution->active = caution->given = caution->begins = 0;
     caution->pace = caution->widening = 1;
+}
+
+/* The covariance that was given, by columns of its lower Cholesky factor; a state that is known, or
+ * follows of those before, has none. */
+void br_caution_advance(br_caution *caution) {
+    double (*p)[BR_NX] = caution->covariance;
+    caution->begins = caution->given ? BR_NX : 0;
+    memset(caution->begin, 0, sizeof caution->begin);
+    for (int j = 0; j < caution->begins; ++j) {
+        double *column = caution->begin[j];
+        for (int i = j; i < BR_NX; ++i) {
+            column[i] = p[i][j];
+            for (int l = 0; l < j; ++l) column[i] -= caution->begin[l][i] * caution->begin[l][j];
+        }
+        const double scale = column[j] > 0 ? 1 / sqrt(column[j]) : 0;
+        for (int i = j; i < BR_NX; ++i) column[i] *= scale;
+    }
+    caution->given = 0;
 }
 
 void br_caution_update(br_mpc *mpc) {
@@ -133,9 +152,11 @@ void br_caution_update(br_mpc *mpc) {
     feedback(mpc, gain);
     static const double none[BR_NX] = {0};
     for (int k = 0; k < BR_N; ++k)
-        for (int j = 0; j < BR_NE; ++j)
-            propagate(&mpc->stage[k], gain[k], j, sigma[k][j],
-                      k ? caution->deviation[k - 1][j] : none, caution->deviation[k][j]);
+        for (int j = 0; j < BR_NE + caution->begins; ++j) {
+            const double *first = j < BR_NE ? none : caution->begin[j - BR_NE];
+            propagate(&mpc->stage[k], gain[k], j < BR_NE ? j : 0, j < BR_NE ? sigma[k][j] : 0,
+                      k ? caution->deviation[k - 1][j] : first, caution->deviation[k][j]);
+        }
     br_timer_note(&mpc->timer, begin, &mpc->timer.caution);
 }
 
@@ -143,7 +164,7 @@ void br_caution_update(br_mpc *mpc) {
  * standard deviations. */
 static double back_off(const br_mpc *mpc, int k, int r, const double *gradient) {
     double squares = 0;
-    for (int j = 0; j < BR_NE; ++j) {
+    for (int j = 0; j < BR_NE + mpc->caution.begins; ++j) {
         double along = 0;
         for (int n = BR_ROW_START[r]; n < BR_ROW_START[r + 1]; ++n)
             along += gradient[n] * mpc->caution.deviation[k][j][BR_ROW_INDEX[n]];

@@ -9,6 +9,7 @@
 
 #define JUMP 2.0         /* a plan that costs more than so many times the one before, shifted, */
 #define JUMP_BY 0.01     /* and so much more */
+#define RECOVER_S 0.25   /* of contradiction; what lasts longer is no glitch */
 #define LEAST_BUDGET 0.1 /* what a step gets however late its cycle began: share of the budget */
 
 struct br_cycle {
@@ -30,6 +31,7 @@ struct br_cycle {
     br_counters counters;
     br_solution solution;
     br_decision decision; /* of the newest cycle */
+    br_fault doubt;       /* the newest state is not known well enough */
     int halted;           /* the phase of a car that is not to be driven; 0: drive */
     int stopping;         /* a stop has begun: since, from which speed */
     double stopping_s, stopping_mps;
@@ -57,6 +59,7 @@ br_mpc_error br_cycle_init(void *memory, size_t size, const br_controller *contr
     cycle->halted = hold ? BR_PHASE_READY : 0;
     cycle->stream.ended = cycle->stream.silent = 1;
     cycle->decision = (br_decision){.status = BR_HALTED, .level = BR_STOP};
+    cycle->counters.instrument = -1;
     *out = cycle;
     return BR_OK;
 }
@@ -178,6 +181,36 @@ static void believe(br_cycle *cycle, double interval_s) {
     counters->fault = br_monitor_check(&cycle->monitor, &cycle->settings, &cycle->controller,
                                        interval_s, &cycle->stream.newest);
     counters->faults[counters->fault] += counters->fault != BR_FAULT_NONE;
+    counters->instrument = -1;
+    cycle->doubt = counters->fault;
+}
+
+/* Why the car is not to be driven by what is estimated: nothing that is believed measures where it
+ * is (errors of the model add up faster than their covariance says), or that is not known to the
+ * bounds. What has been contradicted for so long is not believed again by itself. */
+static br_fault doubtful(br_cycle *cycle, const br_estimate *now) {
+    const double tolerance = fmax(cycle->settings.sensor_tolerance, 1);
+    const double most_m = tolerance * BR_MONITOR_POSITION_M;
+    const double most_rad = tolerance * BR_MONITOR_HEADING_RAD;
+    const double spread = now->p[BR_INDEX_X][BR_INDEX_X] + now->p[BR_INDEX_Y][BR_INDEX_Y];
+    int contradicted;
+    br_fault found = br_estimator_blind(&cycle->estimator, &contradicted);
+    if (!found && now->p[BR_INDEX_PSI][BR_INDEX_PSI] > most_rad * most_rad)
+        found = BR_FAULT_HEADING;
+    const int unknown = spread > most_m * most_m;
+    const double since_s = cycle->stream.newest.time_s - cycle->monitor.trusted_s;
+    cycle->estimator.latched |= contradicted && (unknown || since_s > RECOVER_S);
+    return !found && unknown ? BR_FAULT_POSITION : found;
+}
+
+/* What speaks against the newest state, or against an instrument. */
+static void report(br_cycle *cycle) {
+    br_counters *counters = &cycle->counters;
+    counters->fault = cycle->doubt;
+    counters->instrument = br_estimator_faulty(&cycle->estimator);
+    if (counters->instrument >= 0)
+        counters->fault = cycle->estimator.instrument[counters->instrument].fault;
+    counters->faults[counters->fault] += counters->fault != BR_FAULT_NONE;
 }
 
 /* The residual's variance where the car is, for the next estimate. */
@@ -193,25 +226,25 @@ static void foresee(br_cycle *cycle) {
 static const double *estimate(br_cycle *cycle, const br_measured *before) {
     br_measured *newest = &cycle->stream.newest;
     static const double none[BR_NX] = {0};
-    const double bound_m = BR_MONITOR_POSITION_M * fmax(cycle->settings.sensor_tolerance, 1);
+    const int begins = cycle->unknown;
     memcpy(newest->x, cycle->unknown ? none : before->x, sizeof newest->x);
     foresee(cycle);
     br_estimator *estimator = &cycle->estimator;
     const br_mpc_error error = br_estimator_advance(estimator, newest->time_s, newest->u_applied,
                                                     cycle->has_variance ? cycle->variance : NULL,
                                                     newest->measured, newest->measurements);
-    cycle->unknown = error != BR_OK;
+    cycle->unknown = error != BR_OK || estimator->astray;
     cycle->has_variance = 0;
-    cycle->counters.fault = BR_FAULT_NONE;
-    if (error) return NULL;
-    const br_estimate *now = &br_estimator_event(estimator, estimator->count - 1)->after;
-    memcpy(newest->x, now->x, sizeof newest->x);
-    const double spread = now->p[BR_INDEX_X][BR_INDEX_X] + now->p[BR_INDEX_Y][BR_INDEX_Y];
-    if (spread > bound_m * bound_m) cycle->counters.fault = BR_FAULT_POSITION;
-    cycle->counters.faults[cycle->counters.fault] += cycle->counters.fault != BR_FAULT_NONE;
-    if (!cycle->counters.fault) cycle->monitor.trusted_s = newest->time_s;
-    cycle->monitor.measured_s = newest->time_s;
-    return estimator->corrected;
+    cycle->doubt = BR_FAULT_NONE;
+    if (!error) {
+        const br_estimate *now = br_estimator_now(estimator);
+        memcpy(newest->x, now->x, sizeof newest->x);
+        cycle->doubt = doubtful(cycle, now);
+        if (!cycle->doubt || begins) cycle->monitor.trusted_s = newest->time_s;
+        cycle->monitor.measured_s = newest->time_s;
+    }
+    report(cycle);
+    return error ? NULL : estimator->corrected;
 }
 
 br_reception br_cycle_observe(br_cycle *cycle, const br_measured *state) {
@@ -239,14 +272,15 @@ br_reception br_cycle_observe(br_cycle *cycle, const br_measured *state) {
         cycle->has_variance = 0;
         cycle->unknown = state->estimated;
     }
-    const br_fault doubted = cycle->counters.fault;
+    const br_fault doubted = cycle->doubt;
     const int unknown = cycle->unknown;
     const double *noise = NULL;
     if (state->estimated)
         noise = estimate(cycle, &before);
     else
         believe(cycle, interval_s);
-    if (doubted || unknown || cycle->unknown || cycle->counters.fault)
+    const int begun = state->estimated && !cycle->estimator.agreed; /* here, perhaps elsewhere */
+    if (doubted || unknown || cycle->unknown || cycle->doubt || begun)
         cycle->shown.duration_s = 0;
     else if (!begins)
         br_shown_observe(&cycle->shown, cycle->mpc, &cycle->settings, &before,
@@ -275,6 +309,7 @@ void br_cycle_go(br_cycle *cycle) {
     if (!cycle) return;
     cycle->halted = cycle->stopping = 0;
     br_monitor_restart(&cycle->monitor); /* whoever says go has looked at the sensors */
+    if (cycle->doubt && cycle->stream.newest.estimated) br_estimator_reset(&cycle->estimator);
 }
 
 /* --- one cycle --- */
@@ -327,7 +362,7 @@ static void reckon(br_cycle *cycle, double decided_at_s) {
     if (!cycle->reckoned) {
         cycle->reckoned_s = newest->time_s + cycle->settings.stale_s;
         if (br_delay_at_acting(&cycle->delay, &cycle->settings, controller, newest,
-                               cycle->reckoned_s, cycle->counters.delay_s, x, u))
+                               cycle->reckoned_s, cycle->counters.delay_s, x, u, NULL))
             return;
         cycle->reckoned = 1;
     }
@@ -347,8 +382,9 @@ static void count(br_cycle *cycle, int status) {
         cycle->counters.cost_jumps += solution->cost > JUMP * solution->shifted_cost + JUMP_BY;
 }
 
-/* The state in which the new input begins to act, and what acts until then; -1: not known. */
-static int at_acting(br_cycle *cycle, double u[BR_NU]) {
+/* The state in which the new input begins to act, and what acts until then; -1: not known.
+ * carried: the estimate, which goes along; NULL: there is none. */
+static int at_acting(br_cycle *cycle, double u[BR_NU], br_carried *carried) {
     const br_measured *newest = &cycle->stream.newest;
     double *x = cycle->acting_x;
     if (newest->lockstep && cycle->counters.delay_s == 0 &&
@@ -358,14 +394,28 @@ static int at_acting(br_cycle *cycle, double u[BR_NU]) {
         return 0;
     }
     return br_delay_at_acting(&cycle->delay, &cycle->settings, &cycle->controller, newest,
-                              cycle->decision.decided_at_s, cycle->counters.delay_s, x, u);
+                              cycle->decision.decided_at_s, cycle->counters.delay_s, x, u, carried);
+}
+
+/* The same for a step, which gets the covariance of an estimated state. */
+static int begin_step(br_cycle *cycle, double u[BR_NU]) {
+    if (!cycle->mpc || !cycle->stream.newest.estimated) return at_acting(cycle, u, NULL);
+    br_estimator *estimator = &cycle->estimator;
+    br_carried carried = {.estimator = estimator,
+                          .by = br_estimator_event(estimator, estimator->count - 1),
+                          .at = *br_estimator_now(estimator)};
+    double covariance[BR_NX * BR_NX];
+    if (at_acting(cycle, u, &carried)) return -1;
+    for (int i = 0; i < BR_NX; ++i)
+        memcpy(covariance + BR_NX * i, carried.at.p[i], BR_NX * sizeof(double));
+    return br_mpc_set_covariance(cycle->mpc, covariance) ? -1 : 0;
 }
 
 static int step(br_cycle *cycle, const br_environment *environment, double acting_s,
                 double budget_s) {
     const br_controller *controller = &cycle->controller;
     double u[BR_NU];
-    if (at_acting(cycle, u)) return BR_UNPREDICTABLE;
+    if (begin_step(cycle, u)) return BR_UNPREDICTABLE;
     cycle->acting = 1;
     /* Where the delay measured has fallen, the moment of acting may even go back. */
     const double elapsed_s = cycle->stepped ? fmax(acting_s - cycle->stepped_s, 0) : 0;
@@ -407,10 +457,10 @@ static void drive(br_cycle *cycle, const br_environment *environment, double act
     if (decision->decided_at_s - newest->time_s > stale_s) {
         decision->status = BR_NO_STATE;
         reckon(cycle, decision->decided_at_s);
-    } else if (cycle->counters.fault && doubted_s > stale_s + STAGE_ROUNDING * BR_TS) {
+    } else if (cycle->doubt && doubted_s > stale_s + STAGE_ROUNDING * BR_TS) {
         double u[BR_NU];
         decision->status = BR_DOUBTED;
-        cycle->acting = !at_acting(cycle, u);
+        cycle->acting = !at_acting(cycle, u, NULL);
         cycle->vx_mps = newest->x[BR_INDEX_VX];
     } else {
         cycle->reckoned = 0;
@@ -436,7 +486,7 @@ br_mpc_error br_cycle_decide(br_cycle *cycle, const br_environment *environment,
     if (!isfinite(decided_at_s) || !isfinite(budget_s) || !isfinite(spent_s)) return BR_ERROR_TIME;
     br_decision *decision = &cycle->decision;
     const br_measured *newest = &cycle->stream.newest;
-    if (cycle->counters.fault) /* the caller takes its time from states that may be dated ahead */
+    if (cycle->doubt) /* the caller takes its time from states that may be dated ahead */
         decided_at_s -= fmax(cycle->monitor.measured_s - newest->time_s, 0);
     decision->epoch = newest->epoch;
     decision->run = newest->run;
@@ -485,7 +535,7 @@ void br_cycle_rehearse(br_cycle *cycle) {
     if (!cycle || !cycle->stepped) return;
     double x[BR_NX], u[BR_NU];
     br_delay_at_acting(&cycle->delay, &cycle->settings, &cycle->controller, &cycle->stream.newest,
-                       cycle->decision.decided_at_s, cycle->counters.delay_s, x, u);
+                       cycle->decision.decided_at_s, cycle->counters.delay_s, x, u, NULL);
     cycle->controller.rehearse(cycle->controller.self);
 }
 

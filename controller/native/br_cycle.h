@@ -51,9 +51,17 @@ typedef struct {
 void br_delay_observe(br_delay *delay, const br_driving *settings, const br_measured *state,
                       double *delay_s);
 void br_delay_sent(br_delay *delay, double decided_at_s, const double u[BR_NU]);
+
+/* An estimate that is predicted beside the state. */
+typedef struct {
+    const br_estimator *estimator;
+    const br_event *by; /* whose variance of the residual it takes */
+    br_estimate at;
+} br_carried;
+
 int br_delay_at_acting(br_delay *delay, const br_driving *settings, const br_controller *controller,
                        const br_measured *state, double decided_at_s, double delay_s,
-                       double x[BR_NX], double u[BR_NU]);
+                       double x[BR_NX], double u[BR_NU], br_carried *carried);
 
 /* --- br_fallback.c: what is sent where there is no solution to send --- */
 

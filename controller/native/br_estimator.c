@@ -14,7 +14,12 @@
 
 #if BR_HAS_PATH
 
-#define SAME_S 1e-9 /* times closer than that are one */
+#define SAME_S 1e-9    /* times closer than that are one */
+#define LONGEST_S 1.0  /* without position, or between two periods; after that it begins anew */
+#define BEGINNING 0.25 /* share of the gate until a second pose has agreed with the first */
+#define WIDEST 100.0   /* by how much one measurement may widen the covariance */
+#define APART_S 0.2    /* between two poses whose difference is a velocity */
+#define STEERED 4.0    /* so many times the steering angle's deviation has a car that moves */
 
 /* Chi-squared that one of 1,000 exceeds, by degrees of freedom from 1 on. */
 static const double EXCEEDED[] = {10.828, 13.816, 16.266, 18.467, 20.515, 22.458, 24.322};
@@ -48,19 +53,21 @@ br_mpc_error br_estimator_set(br_estimator *estimator, const br_estimation *sett
 }
 
 void br_estimator_reset(br_estimator *estimator) {
-    if (estimator) estimator->count = 0;
+    if (!estimator) return;
+    estimator->count = estimator->latched = 0;
+    for (int i = 0; i < BR_INSTRUMENTS; ++i) br_instrument_restart(&estimator->instrument[i]);
 }
 
 /* --- between two events --- */
 
 /* x and P after a duration of at most a stage, under u. The residual is that of where the period
  * began, by what is believed now: taken anew at each measurement it would run ahead of the car. */
-static br_mpc_error propagate(const br_estimator *estimator, const br_event *by, double duration,
-                              br_estimate *b) {
+static br_mpc_error propagate(const br_estimator *estimator, const double u[BR_NU],
+                              const double variance[BR_NE], double duration, br_estimate *b) {
     double f[BR_NX * BR_NX], q[BR_NX * BR_NX], fp[BR_NX][BR_NB], begin[BR_NX], next[BR_NX];
     for (int i = 0; i < BR_NX; ++i) begin[i] = b->x[i] - b->way[i];
     const br_mpc_error error =
-        br_mpc_propagate(estimator->mpc, b->x, begin, by->u, duration, by->variance, next, f, q);
+        br_mpc_propagate(estimator->mpc, b->x, begin, u, duration, variance, next, f, q);
     if (error) return error;
     for (int i = 0; i < BR_NX; ++i) {
         b->way[i] += next[i] - b->x[i];
@@ -86,14 +93,15 @@ static br_mpc_error propagate(const br_estimator *estimator, const br_event *by,
     return BR_OK;
 }
 
-static br_mpc_error reach(const br_estimator *estimator, const br_event *by, double duration,
-                          br_estimate *b) {
+br_mpc_error br_estimator_reach(const br_estimator *estimator, const double u[BR_NU],
+                                const double variance[BR_NE], double duration, br_estimate *b) {
     br_mpc_error error = BR_OK;
     for (; duration > BR_TS + SAME_S && !error; duration -= BR_TS) {
-        error = propagate(estimator, by, BR_TS, b);
+        error = propagate(estimator, u, variance, BR_TS, b);
         memset(b->way, 0, sizeof b->way);
     }
-    return error || duration < SAME_S ? error : propagate(estimator, by, fmin(duration, BR_TS), b);
+    if (error || duration < SAME_S) return error;
+    return propagate(estimator, u, variance, fmin(duration, BR_TS), b);
 }
 
 /* --- a measurement --- */
@@ -104,7 +112,7 @@ static int offset_in(int state) {
 }
 
 /* Column of P H', or row of H P. */
-static double observed(const double row[BR_NB], int state) {
+double br_estimate_observed(const double row[BR_NB], int state) {
     const int offset = offset_in(state);
     return row[state] + (offset < 0 ? 0 : row[offset]);
 }
@@ -147,33 +155,32 @@ static void update(const br_measurement *m, double hp[BR_NX][BR_NB], double k[BR
         for (int j = i; j < BR_NB; ++j) {
             double sum = left[i][j];
             for (int a = 0; a < m->count; ++a)
-                sum += k[j][a] *
-                       (m->deviation[a] * m->deviation[a] * k[i][a] - observed(left[i], m->of[a]));
+                sum += k[j][a] * (m->deviation[a] * m->deviation[a] * k[i][a] -
+                                  br_estimate_observed(left[i], m->of[a]));
             b->p[i][j] = b->p[j][i] = sum;
         }
 }
 
 /* What the measurement says beyond what is believed; its squared distance by the covariance of
  * that. -1: refused, and nothing changes. */
-static double take(const br_estimation *settings, const br_measurement *m, br_estimate *b) {
+static double take(double gate, const br_measurement *m, br_estimate *b) {
     const int n = m->count;
     double hp[BR_NX][BR_NB], s[BR_NX][BR_NX], k[BR_NB][BR_NX];
     double difference[BR_NX], weighted[BR_NX], squared = 0;
     for (int a = 0; a < n; ++a) {
-        difference[a] = m->value[a] - observed(b->x, m->of[a]);
+        difference[a] = m->value[a] - br_estimate_observed(b->x, m->of[a]);
         if (m->of[a] == BR_INDEX_PSI) difference[a] = remainder(difference[a], 2 * M_PI);
         weighted[a] = difference[a];
-        for (int i = 0; i < BR_NB; ++i) hp[a][i] = observed(b->p[i], m->of[a]);
+        for (int i = 0; i < BR_NB; ++i) hp[a][i] = br_estimate_observed(b->p[i], m->of[a]);
     }
     for (int a = 0; a < n; ++a) {
-        for (int c = 0; c < n; ++c) s[a][c] = observed(hp[a], m->of[c]);
+        for (int c = 0; c < n; ++c) s[a][c] = br_estimate_observed(hp[a], m->of[c]);
         s[a][a] += m->deviation[a] * m->deviation[a];
     }
     if (!factorise(n, s)) return -1;
     solve(n, s, weighted);
     for (int a = 0; a < n; ++a) squared += difference[a] * weighted[a];
-    if (!(squared >= 0) || (settings->gate > 0 && squared > settings->gate * EXCEEDED[n - 1]))
-        return -1;
+    if (!(squared >= 0) || (gate > 0 && squared > gate * EXCEEDED[n - 1])) return -1;
     for (int i = 0; i < BR_NB; ++i) {
         for (int a = 0; a < n; ++a) {
             b->x[i] += hp[a][i] * weighted[a];
@@ -217,25 +224,66 @@ static int insert(br_estimator *estimator, int k, const br_event *given) {
     return k;
 }
 
-/* The earliest of these that is of position and heading; NULL: none is. */
-static const br_measurement *first_pose(const br_measurement *measurements, int count,
-                                        double latest_s) {
+static int of_pose(const br_measurement *m) {
     const unsigned pose = 1u << BR_INDEX_X | 1u << BR_INDEX_Y | 1u << BR_INDEX_PSI;
+    unsigned seen = 0;
+    for (int a = 0; a < m->count; ++a) seen |= 1u << m->of[a];
+    return (seen & pose) == pose;
+}
+
+/* The earliest of these that is of position and heading, and is new; NULL: none is. */
+static const br_measurement *first_pose(const br_estimator *estimator,
+                                        const br_measurement *measurements, int count,
+                                        double latest_s) {
     const br_measurement *first = NULL;
     for (const br_measurement *m = measurements; m < measurements + count; ++m) {
-        unsigned seen = 0;
-        if (!valid(m) || m->time_s > latest_s || (first && m->time_s >= first->time_s)) continue;
-        for (int a = 0; a < m->count; ++a) seen |= 1u << m->of[a];
-        if ((seen & pose) == pose) first = m;
+        if (!valid(m) || m->time_s > latest_s || m->time_s < latest_s - LONGEST_S) continue;
+        if (!of_pose(m) || br_instrument_holds(&estimator->instrument[m->instrument], m)) continue;
+        if (!first || m->time_s < first->time_s) first = m;
     }
     return first;
 }
 
-static void begin(br_estimator *estimator, const br_measurement *m) {
+/* The number of a pose's state. */
+static double value_of(const br_measurement *m, int state) {
+    int a = 0;
+    while (m->of[a] != state) ++a;
+    return m->value[a];
+}
+
+/* Velocities, yaw rate and steering angle around what the difference of two poses says, in place of
+ * around 0 (Bar-Shalom et al., section 5.5.3). */
+static void begin_moving(const br_measurement *before, const br_measurement *m, br_estimate *b) {
+    const double dt = m->time_s - before->time_s, *deviation = m->deviation;
+    const double dx = value_of(m, BR_INDEX_X) - value_of(before, BR_INDEX_X);
+    const double dy = value_of(m, BR_INDEX_Y) - value_of(before, BR_INDEX_Y);
+    const double psi = value_of(m, BR_INDEX_PSI);
+    const double dpsi = remainder(psi - value_of(before, BR_INDEX_PSI), 2 * M_PI);
+    const double c = cos(psi - dpsi / 2), s = sin(psi - dpsi / 2);
+    double noise = 0;
+    for (int a = 0; a < m->count; ++a) noise = fmax(noise, 2 * deviation[a] * deviation[a]);
+    b->x[BR_INDEX_VX] = (c * dx + s * dy) / dt;
+    b->x[BR_INDEX_VY] = (c * dy - s * dx) / dt;
+    b->x[BR_INDEX_OMEGA] = dpsi / dt;
+    b->x[BR_INDEX_DELTA] =
+        atan2(BR_WHEELBASE_M * b->x[BR_INDEX_OMEGA], fmax(b->x[BR_INDEX_VX], BR_WHEELBASE_M / dt));
+    for (int i = 0; i < BR_NX; ++i) {
+        const int rate = i == BR_INDEX_VX || i == BR_INDEX_VY || i == BR_INDEX_OMEGA;
+        if (rate) b->p[i][i] += noise / (dt * dt);
+    }
+    b->p[BR_INDEX_DELTA][BR_INDEX_DELTA] *= STEERED * STEERED;
+}
+
+/* before: another pose, shortly before; NULL: none. */
+static void begin(br_estimator *estimator, const br_measurement *m, const br_measurement *before) {
     br_event first = {.time_s = m->time_s};
     br_estimate *b = &first.after;
+    br_estimator_reset(estimator);
+    estimator->agreed = estimator->astray = 0;
+    estimator->posed_s = m->time_s;
     for (int i = 0; i < BR_NB; ++i)
         b->p[i][i] = estimator->settings.start[i] * estimator->settings.start[i];
+    if (before) begin_moving(before, m, b);
     for (int a = 0; a < m->count; ++a) {
         const int i = m->of[a];
         b->x[i] = m->value[a];
@@ -264,24 +312,92 @@ static int place(br_estimator *estimator, const br_measurement *m) {
     given.time_s =
         fmin(fmax(m->time_s, br_estimator_event(estimator, k - 1)->time_s), given.time_s);
     given.measured = *m;
-    given.judged = 0;
+    given.judged = given.left_out = 0;
+    given.widening = 1;
     return insert(estimator, k, &given);
 }
 
-/* A measurement has been taken, or refused. */
-static void count(br_estimator *estimator, br_event *one, double squared) {
-    br_instrument *instrument = &estimator->instrument[one->measured.instrument];
-    if (one->judged) return;
-    one->judged = 1;
+/* It is of no time that is kept, or no measurement at all; one from before the beginning may come
+ * late. */
+static void lose(br_estimator *estimator, const br_measurement *m, double time_s) {
+    if (m->instrument < 0 || m->instrument >= BR_INSTRUMENTS) return;
+    br_instrument *instrument = &estimator->instrument[m->instrument];
+    const int early = estimator->count < BR_EVENTS && m->time_s >= time_s - LONGEST_S;
+    instrument->lost += 1;
+    if (m->time_s <= time_s + SAME_S && early && valid(m)) return;
+    br_instrument_bad(instrument, BR_FAULT_TIME);
+}
+
+/* A measurement has been compared for the first time; whether it counts for the estimate. */
+static int count(br_estimator *estimator, const br_event *one, double squared) {
+    const br_measurement *m = &one->measured;
+    br_instrument *instrument = &estimator->instrument[m->instrument];
     if (squared < 0) {
         instrument->refused += 1;
         instrument->refused_in_row += 1;
-        return;
+        if (estimator->agreed)
+            br_instrument_bad(instrument, br_instrument_kind(m, &one->after));
+        else
+            estimator->astray += of_pose(m);
+        return 0;
+    }
+    instrument->refused_in_row = 0;
+    if (!br_instrument_good(instrument, estimator->latched)) {
+        instrument->left_out += 1;
+        return 0;
     }
     instrument->used += 1;
-    instrument->refused_in_row = 0;
     instrument->squared += squared;
-    instrument->expected += one->measured.count;
+    instrument->expected += m->count;
+    if (!of_pose(m)) return 1;
+    estimator->agreed = 1;
+    estimator->astray = 0;
+    estimator->posed_s = fmax(m->time_s, estimator->posed_s);
+    return 1;
+}
+
+/* Refused again, though no farther off than a model may err: that knows less than it says, and the
+ * covariance grows (a fading memory, Bar-Shalom et al., section 5.5.4). */
+static double widen(const br_estimator *estimator, const br_event *one) {
+    const br_measurement *m = &one->measured;
+    const double gate = estimator->settings.gate;
+    if (!(gate > 0) || !estimator->agreed || !br_instrument_near(m, &one->after)) return 1;
+    int contradicted;
+    if (!estimator->instrument[m->instrument].refused_in_row) return 1;
+    if (br_estimator_blind(estimator, &contradicted)) return 1;
+    br_estimate alone = one->after;
+    return fmin(fmax(take(INFINITY, m, &alone) / m->count, 1), WIDEST);
+}
+
+/* The covariance, but for the offsets: these belong to the sensors. */
+static void grow(double by, br_estimate *b) {
+    for (int i = 0; i < BR_NB; ++i)
+        for (int j = 0; j < BR_NB; ++j)
+            b->p[i][j] *= (i < BR_NX ? sqrt(by) : 1) * (j < BR_NX ? sqrt(by) : 1);
+}
+
+/* The measurement in what is believed at its time. */
+static void judge(br_estimator *estimator, br_event *one) {
+    br_instrument *instrument = &estimator->instrument[one->measured.instrument];
+    const int first = !one->judged;
+    one->judged = 1;
+    if (first && br_instrument_repeats(instrument, &one->measured, &one->after)) {
+        br_instrument_bad(instrument, BR_FAULT_FROZEN);
+        instrument->left_out += 1;
+        one->left_out = 1;
+    }
+    if (one->left_out) return;
+    const double gate = (estimator->agreed ? 1 : BEGINNING) * estimator->settings.gate;
+    br_estimate with = one->after;
+    double squared = take(gate, &one->measured, &with);
+    if (first && squared < 0) one->widening = widen(estimator, one);
+    if (squared < 0 && one->widening > 1) {
+        grow(one->widening, &one->after);
+        with = one->after;
+        squared = take(gate, &one->measured, &with);
+    }
+    if (first && !count(estimator, one, squared)) one->left_out = squared >= 0;
+    if (squared >= 0 && !one->left_out) one->after = with;
 }
 
 /* Everything from the k-th event on is done over. */
@@ -290,10 +406,11 @@ static br_mpc_error redo(br_estimator *estimator, int k) {
         br_event *one = br_estimator_event(estimator, k);
         const br_event *before = br_estimator_event(estimator, k - 1);
         one->after = before->after;
-        const br_mpc_error error = reach(estimator, one, one->time_s - before->time_s, &one->after);
+        const br_mpc_error error = br_estimator_reach(estimator, one->u, one->variance,
+                                                      one->time_s - before->time_s, &one->after);
         if (error) return error;
         if (one->measured.count)
-            count(estimator, one, take(&estimator->settings, &one->measured, &one->after));
+            judge(estimator, one);
         else
             memset(one->after.way, 0, sizeof one->after.way);
     }
@@ -301,20 +418,49 @@ static br_mpc_error redo(br_estimator *estimator, int k) {
 }
 
 /* Puts the measurements where they belong; the first event that is to be done over. */
-static int place_all(br_estimator *estimator, const br_measurement *measurements, int count,
-                     const br_measurement *begun_with) {
+static int place_all(br_estimator *estimator, double time_s, const br_measurement *measurements,
+                     int count, const br_measurement *begun_with) {
     int from = estimator->count - 1;
     for (const br_measurement *m = measurements; m < measurements + count; ++m) {
         if (m == begun_with) continue;
-        const int size = estimator->count, k = place(estimator, m), number = m->instrument;
-        if (k >= 0) {
-            from -= estimator->count == size; /* the oldest has made room */
-            from = k < from ? k : from;
-        } else if (number >= 0 && number < BR_INSTRUMENTS) {
-            estimator->instrument[number].lost += 1;
+        const int size = estimator->count, k = place(estimator, m);
+        if (k < 0) {
+            lose(estimator, m, time_s);
+            continue;
         }
+        from -= estimator->count == size; /* the oldest has made room */
+        from = k < from ? k : from;
+        br_instrument_arrive(&estimator->instrument[m->instrument], m, time_s);
     }
     return from > 1 ? from : 1;
+}
+
+/* The period, with what has been measured. */
+static br_mpc_error period(br_estimator *estimator, const br_event *given,
+                           const br_measurement *measurements, int count,
+                           const br_measurement *begun_with) {
+    const br_event *newest = br_estimator_event(estimator, estimator->count - 1);
+    const double duration = given->time_s - newest->time_s;
+    br_event end = *given;
+    end.after = newest->after;
+    br_estimate predicted = newest->after;
+    br_mpc_error error = br_estimator_reach(estimator, end.u, end.variance, duration, &predicted);
+    insert(estimator, estimator->count, &end);
+    const int from = place_all(estimator, end.time_s, measurements, count, begun_with);
+    if (!error) error = redo(estimator, from);
+    newest = br_estimator_event(estimator, estimator->count - 1);
+    for (int i = 0; i < BR_NX; ++i)
+        estimator->corrected[i] = fmax(predicted.p[i][i] - newest->after.p[i][i], 0);
+    return error;
+}
+
+/* Whether the newest period is too long ago; or, where there is a pose, the newest pose is. */
+static int outdated(br_estimator *estimator, double time_s, int pose) {
+    const double newest_s = br_estimator_event(estimator, estimator->count - 1)->time_s;
+    if (time_s - newest_s > LONGEST_S) return 1;
+    int contradicted;
+    br_estimator_blind(estimator, &contradicted);
+    return pose && time_s - estimator->posed_s > LONGEST_S && !contradicted;
 }
 
 br_mpc_error br_estimator_advance(br_estimator *estimator, double time_s, const double u[BR_NU],
@@ -323,30 +469,31 @@ br_mpc_error br_estimator_advance(br_estimator *estimator, double time_s, const 
     if (!estimator || !u || (count > 0 && !measurements)) return BR_ERROR_NULL;
     if (!estimator->has_settings) return BR_ERROR_NOT_READY;
     if (!isfinite(time_s)) return BR_ERROR_TIME;
-    const br_measurement *first = NULL;
-    if (!estimator->count) {
-        first = first_pose(measurements, count, time_s + SAME_S);
-        if (!first) return BR_ERROR_NOT_READY;
-        begin(estimator, first);
+    const int begun = estimator->count;
+    if (begun && time_s < br_estimator_event(estimator, begun - 1)->time_s - SAME_S)
+        return BR_ERROR_TIME;
+    const br_measurement *pose = first_pose(estimator, measurements, count, time_s + SAME_S);
+    const int anew = !begun || outdated(estimator, time_s, pose != NULL);
+    if (anew && !pose) {
+        estimator->count = 0;
+        for (int i = 0; i < count; ++i) lose(estimator, &measurements[i], time_s);
+        return BR_ERROR_NOT_READY;
     }
-    const br_event *newest = br_estimator_event(estimator, estimator->count - 1);
-    const double duration = time_s - newest->time_s;
-    if (duration < -SAME_S) return BR_ERROR_TIME;
-    br_event end = {.time_s = time_s, .after = newest->after};
+    if (anew) begin(estimator, pose, NULL);
+    br_event end = {.time_s = time_s};
     memcpy(end.u, u, sizeof end.u);
     if (variance) memcpy(end.variance, variance, sizeof end.variance);
-    br_estimate predicted = newest->after;
-    br_mpc_error error = reach(estimator, &end, duration, &predicted);
-    insert(estimator, estimator->count, &end);
-    if (!error) error = redo(estimator, place_all(estimator, measurements, count, first));
-    if (error) {
-        br_estimator_reset(estimator);
-        return error;
+    br_mpc_error error = period(estimator, &end, measurements, count, anew ? pose : NULL);
+    const br_measurement before = estimator->pose;
+    const double apart_s = pose && !anew ? pose->time_s - before.time_s : 0;
+    if (!error && estimator->astray > 1 && apart_s > SAME_S) { /* not at rest, nor where it began */
+        begin(estimator, pose, apart_s < APART_S ? &before : NULL);
+        error = period(estimator, &end, measurements, count, pose);
     }
-    newest = br_estimator_event(estimator, estimator->count - 1);
-    for (int i = 0; i < BR_NX; ++i)
-        estimator->corrected[i] = fmax(predicted.p[i][i] - newest->after.p[i][i], 0);
-    return BR_OK;
+    if (pose) estimator->pose = *pose;
+    for (int i = 0; i < BR_INSTRUMENTS; ++i) br_instrument_wait(&estimator->instrument[i], time_s);
+    if (error) br_estimator_reset(estimator);
+    return error;
 }
 
 br_mpc_error br_estimator_read(const br_estimator *estimator, br_belief *out) {

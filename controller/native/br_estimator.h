@@ -13,6 +13,8 @@ typedef struct {
     double time_s, u[BR_NU], variance[BR_NE]; /* u acted since the event before */
     br_measurement measured;                  /* count 0: the end of a period */
     int judged;                               /* it is in the counts of its instrument */
+    int left_out;
+    double widening; /* of the covariance before it is compared */
     br_estimate after;
 } br_event;
 
@@ -25,11 +27,58 @@ struct br_estimator {
     br_event events[BR_EVENTS];
     double corrected[BR_NX]; /* see br_belief */
     br_instrument instrument[BR_INSTRUMENTS];
+    int agreed, astray;  /* since it began a pose has been used; so many were refused before */
+    double posed_s;      /* of the newest pose that has been used; */
+    br_measurement pose; /* the newest, used or not */
+    int latched;         /* no instrument is believed again */
 };
 
 /* The k-th of its events. */
 static inline br_event *br_estimator_event(br_estimator *estimator, int k) {
     return &estimator->events[estimator->order[k]];
 }
+
+static inline const br_estimate *br_estimator_now(br_estimator *estimator) {
+    return &br_estimator_event(estimator, estimator->count - 1)->after;
+}
+
+/* What is expected of a measured state, its offset included. */
+double br_estimate_observed(const double x[BR_NB], int state);
+
+/* x and P after a duration, under u. */
+br_mpc_error br_estimator_reach(const br_estimator *estimator, const double u[BR_NU],
+                                const double variance[BR_NE], double duration, br_estimate *b);
+
+/* --- br_instrument.c: whether what an instrument reports can be believed --- */
+
+/* A measurement has come by time_s. */
+void br_instrument_arrive(br_instrument *instrument, const br_measurement *m, double time_s);
+
+/* Whether it says the same as before to the bit; though by these estimates that has changed. */
+int br_instrument_holds(const br_instrument *instrument, const br_measurement *m);
+int br_instrument_repeats(br_instrument *instrument, const br_measurement *m, const br_estimate *b);
+
+/* Whether it differs from what is expected by so little that the model may be wrong. */
+int br_instrument_near(const br_measurement *m, const br_estimate *b);
+
+/* What in the measurement is farthest from what is expected. */
+br_fault br_instrument_kind(const br_measurement *m, const br_estimate *b);
+
+/* A measurement speaks against the instrument; or for it: whether that is believed again. */
+void br_instrument_bad(br_instrument *instrument, br_fault kind);
+int br_instrument_good(br_instrument *instrument, int latched);
+
+/* Nothing may have come for too long. */
+void br_instrument_wait(br_instrument *instrument, double time_s);
+
+/* Believes it; counts stay. */
+void br_instrument_restart(br_instrument *instrument);
+
+/* The first instrument that is not believed; -1: all are. */
+int br_estimator_faulty(const br_estimator *estimator);
+
+/* The fault of those that measure position, if none of them is believed; *contradicted: they say
+ * something else, rather than nothing. */
+br_fault br_estimator_blind(const br_estimator *estimator, int *contradicted);
 
 #endif

@@ -144,12 +144,17 @@ typedef struct {
 
 /* What the residual's uncertainty does to the plan: see br_caution.c. */
 typedef struct {
-    int active;                           /* there is an uncertainty to be cautious about */
-    double deviation[BR_N][BR_NE][BR_NX]; /* of the states at the ends of the stages */
-    double tube[BR_N];                    /* by how much the rows are uncertain, */
-    double share[BR_N];                   /* as a share of the room that they leave */
-    double pace;                          /* of the reference, as a share of the line's speed */
-    double widening;                      /* of the last step's standard deviations, the largest */
+    int active; /* there is an uncertainty to be cautious about */
+    int given;  /* covariance of the step at hand; it becomes begin after it: */
+    double covariance[BR_NX][BR_NX];
+    int begins; /* columns of begin, whose squares are the covariance: BR_NX; 0: it is none */
+    double begin[BR_NX][BR_NX];
+    double deviation[BR_N][BR_NE + BR_NX][BR_NX]; /* of the states at the ends of the stages, by
+                                                   * output, then by column of begin */
+    double tube[BR_N];                            /* by how much the rows are uncertain, */
+    double share[BR_N];                           /* as a share of the room that they leave */
+    double pace;     /* of the reference, as a share of the line's speed */
+    double widening; /* of the last step's standard deviations, the largest */
     BR_ALIGNED double correlations[BR_GP_ROOT][BR_COLUMNS];
 } br_caution;
 
@@ -380,6 +385,7 @@ BR_PART void br_watch_update(br_mpc *mpc); /* in the preparation */
 
 BR_PART void br_caution_reset(br_caution *caution);
 BR_PART void br_caution_update(br_mpc *mpc);
+BR_PART void br_caution_advance(br_caution *caution);
 BR_PART void br_caution_tighten(br_mpc *mpc, int k, br_stage_terms *terms);
 BR_PART void br_caution_pace(br_mpc *mpc, double elapsed);
 BR_PART void br_caution_report(br_mpc *mpc); /* into mpc->info */

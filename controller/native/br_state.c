@@ -394,10 +394,18 @@ void br_delay_sent(br_delay *delay, double decided_at_s, const double u[BR_NU]) 
     memcpy(one->u, u, sizeof one->u);
 }
 
+static int carry(const br_controller *controller, double x[BR_NX], const double u[BR_NU],
+                 double duration_s, br_carried *carried) {
+    if (carried &&
+        br_estimator_reach(carried->estimator, u, carried->by->variance, duration_s, &carried->at))
+        return -1;
+    return controller->predict(controller->self, x, u, duration_s, x) ? -1 : 0;
+}
+
 /* x and u when an input decided at that plant time begins to act; -1 if the model cannot follow. */
 int br_delay_at_acting(br_delay *delay, const br_driving *settings, const br_controller *controller,
                        const br_measured *state, double decided_at_s, double delay_s,
-                       double x[BR_NX], double u[BR_NU]) {
+                       double x[BR_NX], double u[BR_NU], br_carried *carried) {
     double now_s = state->time_s;
     const double end_s = fmin(decided_at_s + delay_s, now_s + settings->longest_s);
     memcpy(x, state->x, sizeof state->x);
@@ -410,13 +418,13 @@ int br_delay_at_acting(br_delay *delay, const br_driving *settings, const br_con
         const double from_s = one->decided_at_s + delay_s;
         if (from_s >= end_s) break;
         if (from_s > now_s) {
-            if (controller->predict(controller->self, x, u, from_s - now_s, x)) return -1;
+            if (carry(controller, x, u, from_s - now_s, carried)) return -1;
             now_s = from_s;
         }
         memcpy(u, one->u, sizeof one->u);
     }
     if (end_s <= now_s) return 0;
-    return controller->predict(controller->self, x, u, end_s - now_s, x) ? -1 : 0;
+    return carry(controller, x, u, end_s - now_s, carried);
 }
 
 #endif

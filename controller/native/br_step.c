@@ -214,6 +214,7 @@ static void solve(br_mpc *mpc, double u[BR_NU], br_mpc_status *status, br_mpc_in
     mpc->info.status = *status;
     br_invalidate(mpc, BR_TUBE); /* the next step starts with another plan */
     br_innovation_advance(&mpc->innovation);
+    br_caution_advance(&mpc->caution);
     br_caution_pace(mpc, mpc->elapsed);
     if (info) *info = mpc->info;
 }

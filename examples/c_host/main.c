@@ -7,10 +7,14 @@
  *
  *   epoch run seq time_s lockstep final x y psi vx vy omega delta d delta_rate [delay_s ...]
  *
- * and its answer the line 'epoch run seq decided_at_s d delta_rate status level': 17 digits carry
- * every double. Over UDP the car of a free-running plant also has an input when no state arrives:
- * the controller predicts, then falls back, at its own rate, and gives up after a second of
- * silence.
+ * of which x to delta are not read where readings of instruments follow, or a lone ';' for none:
+ *
+ *   ... ; instrument time_s state value deviation [state value deviation ...] [; ...]
+ *
+ * with instruments and states (0 x to 6 delta) by number. Its answer is the line
+ * 'epoch run seq decided_at_s d delta_rate status level': 17 digits carry every double. Over UDP
+ * the car of a free-running plant also has an input when no state arrives: the controller predicts,
+ * then falls back, at its own rate, and gives up after a second of silence.
  */
 #include <arpa/inet.h>
 #include <errno.h>
@@ -23,7 +27,7 @@
 
 #include "br_files.h"
 
-#define LINE 4096
+#define LINE 8192
 #define SILENT_S 1.0
 #define SHARE 0.8 /* of the period that a cycle may take */
 
@@ -48,17 +52,48 @@ static int set_up(host *h, const char *data) {
     if (br_mpc_abi() != BR_ABI) return failed("library", "not that of the headers: build anew");
     br_mpc_parameters parameters;
     br_driving driving;
+    br_estimation estimation;
     br_mpc_error error = br_mpc_init(block(br_mpc_memory_size()), br_mpc_memory_size(), &h->mpc);
     if (error) return failed("controller", br_mpc_error_text(error));
     if (br_files_load(h->mpc, data, BR_MODEL_IDENTITY, text, sizeof text) ||
-        br_files_settings(data, &parameters, &driving, text, sizeof text))
+        br_files_settings(data, &parameters, &driving, &estimation, text, sizeof text))
         return failed(data, text);
     const size_t size = br_cycle_memory_size();
     error = br_mpc_set_parameters(h->mpc, &parameters);
     if (!error) error = br_cycle_drive_mpc(block(size), size, h->mpc, 0, &h->cycle);
     if (!error) error = br_cycle_set_driving(h->cycle, &driving);
+    if (!error) error = br_cycle_set_estimation(h->cycle, NULL, &estimation);
     if (error) return failed(data, br_mpc_error_text(error));
     br_cycle_set_clock(h->cycle, br_mpc_monotonic, NULL);
+    return 0;
+}
+
+/* One reading, from behind its semicolon on: where it ends; NULL if it is none. */
+static const char *read_measurement(const char *at, br_measurement *m) {
+    char *end;
+    m->instrument = (int)strtol(at, &end, 10);
+    m->time_s = strtod(at = end, &end);
+    if (end == at) return NULL;
+    for (m->count = 0; m->count < BR_NX; ++m->count) {
+        m->of[m->count] = (int)strtol(at = end, &end, 10);
+        if (end == at) break;
+        m->value[m->count] = strtod(end, &end);
+        m->deviation[m->count] = strtod(at = end, &end);
+        if (end == at) return NULL;
+    }
+    return m->count ? end : NULL;
+}
+
+/* What has been measured; -1 if it is no such list. */
+static int read_measurements(const char *at, br_measured *state) {
+    while (*(at += strspn(at, " \t\r\n")) == ';') {
+        state->estimated = 1;
+        at += 1 + strspn(at + 1, " \t\r\n");
+        if (!*at) return 0;
+        if (state->measurements == BR_MEASUREMENTS) return -1;
+        at = read_measurement(at, &state->measured[state->measurements++]);
+        if (!at) return -1;
+    }
     return 0;
 }
 
@@ -88,7 +123,7 @@ static int read_state(const char *line, br_measured *state, int *final) {
         if (end == at) break;
         state->delays_s[state->delays++] = delay_s;
     }
-    return 0;
+    return read_measurements(at, state);
 }
 
 static int write_decision(char *line, size_t size, const br_decision *d) {

@@ -172,29 +172,31 @@ typedef struct {
     const char *name;
     double *number; /* or */
     int *whole;
+    int count; /* of numbers; 0: one */
     int found;
 } setting;
 
 #define SPACE " \t\r\n"
 
-/* The number of one line, "name number", into the setting of its name. */
+/* The numbers of one line, "name number ...", into the setting of its name. */
 static int take_line(const reader *r, char *line, setting *settings, int count) {
     line[strcspn(line, "#")] = 0;
     char *name = line + strspn(line, SPACE);
     if (!*name) return 0;
-    char *at = name + strcspn(name, SPACE), *end;
+    char *at = name + strcspn(name, SPACE), *end = at;
     if (*at) *at++ = 0;
     int i = 0;
     while (i < count && strcmp(settings[i].name, name)) ++i;
     if (i == count) return wrong(r, "has an unknown name", name);
-    const double value = strtod(at, &end);
-    if (end == at) return wrong(r, "lacks a number", name);
+    double value = 0;
+    for (int n = 0; n < (settings[i].count ? settings[i].count : 1); ++n, at = end) {
+        value = strtod(at, &end);
+        if (end == at) return wrong(r, "lacks a number", name);
+        if (!settings[i].whole) settings[i].number[n] = value;
+    }
     if (end[strspn(end, SPACE)]) return wrong(r, "has more than a number", name);
     settings[i].found = 1;
-    if (!settings[i].whole) {
-        *settings[i].number = value;
-        return 0;
-    }
+    if (!settings[i].whole) return 0;
     if (!(value >= 0 && value <= WHOLE_MAX && value == floor(value)))
         return wrong(r, "has no whole number from 0 to 1000", name);
     *settings[i].whole = (int)value;
@@ -202,7 +204,7 @@ static int take_line(const reader *r, char *line, setting *settings, int count) 
 }
 
 int br_files_settings(const char *folder, br_mpc_parameters *parameters, br_driving *driving,
-                      char *text, size_t size) {
+                      br_estimation *estimation, char *text, size_t size) {
     const reader r = {.name = BR_FILE_SETTINGS, .text = text, .text_size = size};
     br_mpc_parameters *p = parameters;
     br_driving *d = driving;
@@ -210,8 +212,12 @@ int br_files_settings(const char *folder, br_mpc_parameters *parameters, br_driv
 #define COUNT_OF_PARAMETERS(field) {.name = #field, .whole = &p->field},
 #define OF_DRIVING(field) {.name = #field, .number = &d->field},
 #define COUNT_OF_DRIVING(field) {.name = #field, .whole = &d->field},
-    setting settings[] = {BR_PARAMETERS(OF_PARAMETERS) BR_SOLVER_FIELDS(
-        OF_PARAMETERS, COUNT_OF_PARAMETERS) BR_DRIVING_FIELDS(OF_DRIVING, COUNT_OF_DRIVING)};
+    setting settings[] = {BR_PARAMETERS(OF_PARAMETERS)
+                              BR_SOLVER_FIELDS(OF_PARAMETERS, COUNT_OF_PARAMETERS)
+                                  BR_DRIVING_FIELDS(OF_DRIVING, COUNT_OF_DRIVING){
+                                      .name = "start", .number = estimation->start, .count = BR_NB},
+                          {.name = "drift", .number = estimation->drift, .count = BR_NB},
+                          {.name = "gate", .number = &estimation->gate}};
     const int count = sizeof settings / sizeof settings[0];
     FILE *file = opened(folder, r.name);
     if (!file) return wrong(&r, "is missing or cannot be read", ANEW);

@@ -15,9 +15,9 @@
  * BR_NE outputs kernel u32, points n u32, offset, scale, signal, noise f64, BR_NZ length scales
  * f64, inputs n x BR_NZ f64, alpha n f64, see br_mpc_gp.
  *
- * settings.txt: a line for each member of br_mpc_parameters and br_driving, its name and its
- * number, or its numbers, in the C locale; what comes after # is a comment. The limits of the
- * inputs are the parameters'.
+ * settings.txt: a line for each member of br_mpc_parameters, br_driving and br_estimation, its name
+ * and its number, or its numbers, in the C locale; what comes after # is a comment. The limits of
+ * the inputs are the parameters'.
  *
  * Whatever a file holds, nothing is read beyond it.
  */
@@ -41,7 +41,7 @@ int br_files_load(br_mpc *mpc, const char *folder, const char *identity, char *t
 
 /* The settings of the folder. 0, or -1 and a sentence in text. */
 int br_files_settings(const char *folder, br_mpc_parameters *parameters, br_driving *driving,
-                      char *text, size_t size);
+                      br_estimation *estimation, char *text, size_t size);
 
 #ifdef __cplusplus
 }

@@ -1,0 +1,194 @@
+"""An instrument that fails at racing speed: it is noticed, named and counted, the car stays on its
+track; and no false alarm under noise, gaps and outliers."""
+
+import math
+from typing import Any
+
+import pytest
+from msgspec.structs import replace
+
+from bayesrace.controller.driver import Level
+from bayesrace.messages import Reading
+from tests.instruments import FINE, ROUGH, Fault, Kit, Seen, mocap, odometry
+from tests.racing import Racing, racing
+
+BEGIN_S = 0.6
+
+
+def changed(**what: Any) -> Fault:
+    """These numbers of a reading, so changed."""
+
+    def report(one: Reading, _: Reading) -> Reading:
+        values = {
+            name: (what[name](value) if name in what else value, deviation)
+            for name, (value, deviation) in one.values.items()
+        }
+        return replace(one, values=values)
+
+    return report
+
+
+def frozen(one: Reading, good: Reading) -> Reading:
+    return replace(one, values=good.values)
+
+
+def dated(by_s: float) -> Fault:
+    return lambda one, _: replace(one, time_s=one.time_s + by_s)
+
+
+def stopped(_: Reading, __: Reading) -> None:
+    return None
+
+
+def drifting(one: Reading, good: Reading) -> Reading | None:
+    """By 1 m/s."""
+    off = one.time_s - good.time_s
+    return changed(x=lambda x: x + off)(one, good)
+
+
+EVER = 1000.0
+# Name: the instrument, its fault, how long it lasts, what it is named, whether the car goes on.
+POSE: dict[str, tuple[Fault, float, set[str], bool]] = {
+    "frozen": (frozen, EVER, {"frozen"}, False),
+    "frozen for 0.2 s": (frozen, 0.2, {"frozen"}, True),
+    "frozen for 2 s": (frozen, 2.0, {"frozen"}, True),
+    "jumped by 1 m": (changed(x=lambda x: x + 1), EVER, {"position"}, False),
+    "jumped by 0.1 m": (changed(y=lambda y: y - 0.1), EVER, {"position"}, False),
+    "jumped for 2 s": (changed(x=lambda x: x + 1), 2.0, {"position"}, False),
+    "flipped by pi": (changed(psi=lambda psi: psi + math.pi), EVER, {"heading"}, False),
+    "drifting": (drifting, EVER, {"position"}, False),
+    "stopped": (stopped, EVER, {"time"}, False),
+    "stopped for 2 s": (stopped, 2.0, {"time"}, True),
+    "of the future": (dated(0.1), EVER, {"time"}, False),
+    "of the past": (dated(-10.0), EVER, {"time"}, False),
+}  # fmt: skip
+FAST: dict[str, tuple[str, Fault, set[str]]] = {
+    "wheel at 0": ("wheel", changed(vx=lambda _: 0.0), {"velocity"}),
+    "wheel in km/h": ("wheel", changed(vx=lambda v: 3.6 * v), {"velocity"}),
+    "wheel negative": ("wheel", changed(vx=lambda v: -v), {"velocity"}),
+    "wheel stopped": ("wheel", stopped, {"time"}),
+    "wheel of the future": ("wheel", dated(0.1), {"time"}),
+    "gyro in degrees": ("gyro", changed(omega=lambda w: math.degrees(w) + 30), {"yaw_rate"}),
+    "gyro jumped": ("gyro", changed(omega=lambda w: w + 2), {"yaw_rate"}),
+    "gyro stopped": ("gyro", stopped, {"time"}),
+    "gyro of the past": ("gyro", dated(-10.0), {"time"}),
+}
+
+
+@pytest.fixture(scope="module")
+def race() -> Racing:
+    return racing()
+
+
+def failed(race: Racing, kit: Kit, name: str, fault: Fault, lasts_s: float, place: float) -> Any:
+    """The loop and what it has driven, from racing speed."""
+    loop = Seen(race, kit)
+    loop.fail(name, fault, BEGIN_S, lasts_s)
+    start = race.moments(100)[round(100 * place)]
+    driven = loop.drive(0, max_time_s=BEGIN_S + 4.0, x0=start)
+    assert race.off_track_m(driven.x) <= 0
+    assert set(driven.levels[10 : round(BEGIN_S / 0.02)]) == {Level.SOLUTION}
+    return loop, driven
+
+
+def first_named(loop: Seen, name: str) -> tuple[float, str, int]:
+    return next((time_s, what, bad) for time_s, what, who, bad in loop.named if who == name)
+
+
+@pytest.mark.parametrize("place", [0.1, 0.45, 0.8])
+@pytest.mark.parametrize("kit", [mocap(ROUGH), odometry()], ids=["mocap", "odometry"])
+@pytest.mark.parametrize("name", POSE)
+def test_a_pose_that_fails_is_named_and_the_car_stays_on_its_track(
+    race: Racing, name: str, kit: Kit, place: float
+) -> None:
+    fault, lasts_s, kinds, goes_on = POSE[name]
+    loop, driven = failed(race, kit, "pose", fault, lasts_s, place)
+    time_s, kind, bad = first_named(loop, "pose")
+    assert kind in kinds
+    if fault is stopped:
+        assert time_s - BEGIN_S <= max(0.15, 5 * kit.every * 0.02) + 0.081
+    else:
+        assert bad <= 5
+    standing = abs(driven.x[-1, 3]) < 0.05
+    assert standing or (goes_on and driven.levels[-1] == Level.SOLUTION)
+
+
+@pytest.mark.parametrize("place", [0.1, 0.45, 0.8])
+@pytest.mark.parametrize("name", FAST)
+def test_a_wheel_or_gyro_that_fails_is_named_and_the_car_drives_on(
+    race: Racing, name: str, place: float
+) -> None:
+    which, fault, kinds = FAST[name]
+    loop, driven = failed(race, odometry(), which, fault, EVER, place)
+    _, kind, bad = first_named(loop, which)
+    assert kind in kinds
+    assert bad <= 5 + 4 or fault is stopped  # four readings come with a state
+    assert {who for *_, who, _ in loop.named} == {"", which}
+    assert set(driven.levels[10:]) == {Level.SOLUTION}
+    counts = loop.driver.instruments[which]
+    assert counts.refused + counts.lost + counts.left_out >= 5 or fault is stopped
+
+
+BEYOND = pytest.mark.xfail(reason="without gyro the estimate errs: 1 mm off the track", strict=True)
+
+
+@pytest.mark.parametrize(
+    ("which", "place"),
+    [
+        *(("wheel", place) for place in (0.0, 0.17, 0.33, 0.5, 0.67, 0.8)),
+        *(("gyro", place) for place in (0.0, 0.17, 0.33, 0.5, 0.8)),
+        pytest.param("gyro", 0.67, marks=BEYOND),
+    ],
+)
+def test_a_frozen_wheel_or_gyro_never_takes_the_car_off_its_track(
+    race: Racing, which: str, place: float
+) -> None:
+    """Named once it has been wrong five times."""
+    loop, driven = failed(race, odometry(), which, frozen, EVER, place)
+    time_s, kind, _ = first_named(loop, which)
+    assert kind == "frozen"
+    assert time_s - BEGIN_S < 0.15
+    assert {who for *_, who, _ in loop.named} == {"", which}
+    assert driven.levels[-1] == Level.SOLUTION
+
+
+@pytest.mark.parametrize("noise", [FINE, ROUGH])
+@pytest.mark.parametrize("kit", [mocap, odometry])
+def test_no_alarm_without_a_fault(race: Racing, kit: Any, noise: tuple[float, float]) -> None:
+    for seed in range(2):
+        loop = Seen(race, kit(noise), seed)
+        driven = loop.drive(2)
+        assert (driven.off_track_m <= 0).all()
+        assert {what for _, what, *_ in loop.named} == {""}
+
+
+@pytest.mark.check
+@pytest.mark.parametrize("seed", range(1, 9))
+def test_no_alarm_on_random_tracks(seed: int) -> None:
+    race = racing(f"random:{seed}")
+    for kit in (mocap(FINE), mocap(ROUGH), mocap(ROUGH, 2)):
+        loop = Seen(race, kit, seed)
+        assert (loop.drive(2).off_track_m <= 0).all()
+        assert {what for _, what, *_ in loop.named} == {""}
+
+
+def test_a_car_that_has_stopped_drives_on_after_go(race: Racing) -> None:
+    loop = Seen(race, mocap())
+    loop.fail("pose", changed(x=lambda x: x + 1), BEGIN_S, 2.0)
+    loop.go_s = 4.0
+    driven = loop.drive(0, max_time_s=6.0, x0=race.moments(4)[1])
+    assert race.off_track_m(driven.x) <= 0
+    stood, after = driven.time_s > 3.0, driven.time_s > 4.1
+    assert abs(driven.x[stood & (driven.time_s < 4.0), 3]).max() < 0.05
+    assert driven.x[-1, 3] > 1
+    assert {what for time_s, what, *_ in loop.named if time_s > 4.05} == {""}
+    assert set(driven.levels[after[: len(driven.levels)]]) == {Level.SOLUTION}
+
+
+def test_a_car_that_rolls_at_any_speed_is_driven_after_two_poses(race: Racing) -> None:
+    for k, start in enumerate(race.moments(8)):
+        loop = Seen(race, mocap(ROUGH), seed=k)
+        driven = loop.drive(0, max_time_s=1.5, x0=start)
+        assert race.off_track_m(driven.x) <= 0
+        assert set(driven.levels[10:]) == {Level.SOLUTION}
+        assert not any(who for *_, who, _ in loop.named)
