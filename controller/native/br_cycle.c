@@ -191,12 +191,9 @@ static void believe(br_cycle *cycle, double interval_s) {
 static br_fault doubtful(br_cycle *cycle, const br_estimate *now) {
     const double tolerance = fmax(cycle->settings.sensor_tolerance, 1);
     const double most_m = tolerance * BR_MONITOR_POSITION_M;
-    const double most_rad = tolerance * BR_MONITOR_HEADING_RAD;
     const double spread = now->p[BR_INDEX_X][BR_INDEX_X] + now->p[BR_INDEX_Y][BR_INDEX_Y];
     int contradicted;
-    br_fault found = br_estimator_blind(&cycle->estimator, &contradicted);
-    if (!found && now->p[BR_INDEX_PSI][BR_INDEX_PSI] > most_rad * most_rad)
-        found = BR_FAULT_HEADING;
+    const br_fault found = br_estimator_blind(&cycle->estimator, &contradicted);
     const int unknown = spread > most_m * most_m;
     const double since_s = cycle->stream.newest.time_s - cycle->monitor.trusted_s;
     cycle->estimator.latched |= contradicted && (unknown || since_s > RECOVER_S);
