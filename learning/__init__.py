@@ -10,5 +10,7 @@ In the order of use:
 4. :mod:`.training` puts these together, also lap by lap in another process.
 5. :mod:`.validation` computes what the nominal model misses, and compares weights with another
    drive.
-6. :mod:`.search` is apart: it finds the minimum of a costly function, such as a lap by its line.
+6. :mod:`.identification` finds the numbers of a car's file: :mod:`.instruments` reads what was
+   measured, :mod:`.window_fit` fits :mod:`.single_track` to it.
+7. :mod:`.search` is apart: it finds the minimum of a costly function, such as a lap by its line.
 """

@@ -22,8 +22,8 @@ EVIL = "a\x1b[2Jb\x07c"
 """Of which a terminal would obey a part."""
 
 SUBCOMMANDS = (
-    "race", "drive", "report", "bench", "tracks", "cars", "raceline", "collect", "train", "build",
-    "export", "limit",
+    "race", "drive", "report", "bench", "tracks", "cars", "raceline", "collect", "identify",
+    "train", "build", "export", "limit",
     "plant", "controller", "status", "stop", "go", "router", "latency",
     "fmu export", "fmu inspect", "fmu weights",
     "validate", "publish", "rollback", "learn",

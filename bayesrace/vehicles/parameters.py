@@ -12,7 +12,7 @@ A car is a TOML file. Its sections are those of :data:`SECTIONS`, besides ``[tyr
 
 import hashlib
 import json
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Final
@@ -375,11 +375,11 @@ def _check_model(section: str, models: Collection[str], given: Any) -> None:
         )
 
 
-def write_car(path: Path | str, car: CarParameters) -> None:
-    """Writes the car with all its values, each with its meaning; :func:`read_car` reads it."""
+def write_car(path: Path | str, car: CarParameters, remarks: Sequence[str] = ()) -> None:
+    """Writes remarks, and the car with all its values and their meaning, for :func:`read_car`."""
     parts = [(section, getattr(car, section, car)) for section in _ORDER]
     parts += [(f"tuning.{name}", part) for name, part in car.tuning]
-    lines = [f'name = "{car.name}"']
+    lines = [*(f"# {one}" for one in remarks), f'name = "{car.name}"']
     for section, part in parts:
         if part is None:  # tyres that are not known
             continue

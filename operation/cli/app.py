@@ -42,7 +42,7 @@ _EXTRAS: Final = {
 _TASKS: Final = {
     "Race": "race.race race.report",
     "Prepare": "tracks.tracks tracks.cars tracks.raceline learning.collect "
-    "learning.train learning.validate export.build",
+    "learning.identify learning.train learning.validate export.build",
     "Drive": "processes.plant processes.controller race.drive processes.status processes.stop "
     "processes.go processes.router processes.doctor configuration.config configuration.certs",
     "Learn while driving": "learning.learn learning.publish learning.rollback",

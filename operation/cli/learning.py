@@ -1,5 +1,5 @@
-"""``collect``, ``train``, ``validate``, ``learn``, ``publish``, ``rollback``: from drives to
-weights in use."""
+"""``collect``, ``identify``, ``train``, ``validate``, ``learn``, ``publish``, ``rollback``: from
+drives to a car's file, and to weights in use."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from bayesrace.operation.settings import PreparationSettings
     from bayesrace.transport import Endpoints
 
-__all__ = ["collect", "learn", "publish", "rollback", "train", "validate"]
+__all__ = ["collect", "identify", "learn", "publish", "rollback", "train", "validate"]
 
 _ARTEFACT: Final = options.value(
     "Built controller to learn for.", metavar="DIR", shown="the default one"
@@ -62,6 +62,42 @@ def collect(
         f"{len(driven.u)} samples, {int((off_track_m > 0).sum())} of them off the track, "
         f"up to {float(driven.x[:, 3].max()):.2f} m/s: {out}"
     )
+
+
+def identify(
+    logs: list[Path] = options.argument("LOG", "Run logs (MCAP) of drives of the car.", ()),
+    car: str = options.value(
+        "Car to begin with, of whose file geometry and mass stay.", "", shown="named by the logs"
+    ),
+    out: Path = options.out_file(Path("identified.toml")),
+    picture: Path | None = options.new_file("Draw accelerations, measured and modelled (PNG)."),
+    wheelbase: bool = options.flag("--wheelbase", "Find the wheelbase, too; steering gain is 1."),
+    name: str = options.CAR_NAME,
+) -> None:
+    """Identify a car from drives: what its file needs and a ruler does not measure.
+
+    Motor and drag, delays, the steering's offset, gain and lag, friction, and the sensors' noise,
+    each with its standard error. The drives excite both inputs, as those of 'collect' do.
+    """
+    from bayesrace.learning.identification import identify as identified_of
+    from bayesrace.learning.instruments import driven_car, read_runs
+    from bayesrace.operation.terminal import tables
+    from bayesrace.operation.terminal.terminal import Terminal
+    from bayesrace.vehicles import get_car, write_car
+
+    parameters, wanted = driven_car(logs, get_car(car) if car else None, name)
+    with options.stages_shown() as stages, stages.stage("identify the car") as stage:
+        runs, instruments = read_runs(logs, wanted)
+        found = identified_of(
+            parameters, runs, instruments, wheelbase=wheelbase, progress=stage.update
+        )
+    if picture is not None:
+        from bayesrace.operation.report.identification import write_comparison
+
+        write_comparison(found.comparison, found.car, picture)
+    write_car(out, found.car, found.remarks([path.name for path in logs]))
+    tables.print_identified(found, Terminal())
+    typer.echo(f"{out}")
 
 
 @options_of("bayesrace.learning.settings.TrainingSettings", "restarts seed")

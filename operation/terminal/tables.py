@@ -3,7 +3,7 @@
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
-from typing import Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from rich.console import Console
 from rich.table import Table
@@ -18,6 +18,9 @@ from bayesrace.operation.terminal import SMOOTHNESS
 from bayesrace.operation.terminal.terminal import plain_table
 from bayesrace.vehicles.parts import GRAVITY_MPS2
 
+if TYPE_CHECKING:
+    from bayesrace.learning.identification import Identified
+
 __all__ = [
     "COLUMNS",
     "GP_COLUMNS",
@@ -25,6 +28,7 @@ __all__ = [
     "drive_text",
     "gp_cells",
     "print_beyond_limits",
+    "print_identified",
     "print_kernels",
     "print_table",
     "print_validation",
@@ -256,6 +260,20 @@ def print_beyond_limits(dropped: Mapping[str, int], kept: int, console: Console)
     if (beyond := dropped.get("outside limits", 0)) > kept:
         text = f"{beyond} samples are beyond the car's limits; --all-samples keeps them"
         console.print(Text(text, style="yellow"), soft_wrap=True)
+
+
+def print_identified(found: "Identified", console: Console) -> None:
+    """One row a number, with its standard error; how much was driven; what is still unknown."""
+    table = plain_table("", "value", "± std. error", "unit", "meaning")
+    table.columns[4].justify, table.columns[4].no_wrap = "left", False
+    for one in found.values:
+        table.add_row(one.name, f"{one.value:.4g}", f"{one.error:.2g}", one.unit, one.meaning)
+    console.print(table)
+    text = f"{found.used_s:.1f} s of {found.driven_s:.1f} s driven are used"
+    console.print(Text(f"{text}; {found.refused} readings are far from all others"))
+    if not found.limit:
+        text = "friction: this drive did not reach the limit of the tyres; drive faster for it"
+        console.print(Text(text, style="yellow"))
 
 
 def print_validation(result: ValidationResult, console: Console) -> None:

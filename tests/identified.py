@@ -1,0 +1,121 @@
+"""Drives by pure pursuit, exact, and their logs as instruments would have made them."""
+
+import functools
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+from msgspec import structs
+from rich.console import Console
+
+from bayesrace.arrays import Floats
+from bayesrace.controller.pure_pursuit import PurePursuit, PurePursuitSettings
+from bayesrace.controller.python_controller import PythonController
+from bayesrace.log import LogWriter
+from bayesrace.messages import STATE, Reading, State, car_key, encode
+from bayesrace.operation.closed_loop import ClosedLoop, Driven
+from bayesrace.operation.collect import room_beside, training_line
+from bayesrace.operation.drive import RunPlan, run_request
+from bayesrace.operation.preparation import Prepared, prepare
+from bayesrace.operation.settings import PreparationSettings
+from bayesrace.operation.terminal.terminal import stages_on
+from bayesrace.vehicles import car_text, get_car
+
+__all__ = ["GYRO_NOISE", "GYRO_OFFSET", "TRIM", "exact", "plain", "prepared_for", "seen"]
+
+TRIM = 0.02
+"""Steering angle at a commanded angle of 0 [rad]."""
+
+GYRO_OFFSET, GYRO_NOISE = 0.05, 0.02
+"""Of the yaw rate [rad/s]."""
+
+
+@functools.cache
+def prepared_for(car: str) -> Prepared:
+    """With the default training drive."""
+    with stages_on(Console(quiet=True)) as stages:
+        settings = PreparationSettings(car=get_car(car))
+        return prepare(settings, (get_car(car).race_track,), stages)
+
+
+@functools.cache
+def exact(name: str, duration_s: float, seed: int = 1, scale: float | None = None) -> Driven:
+    """A training drive of a car whose steering is off by :data:`TRIM`, as it was."""
+    car, files = get_car(name), prepared_for(name)
+    assert files.training is not None
+    track, line = files.training.driven_on.track, files.training.driven_on.line
+    settings = PurePursuitSettings(seed=seed, speed_scale=scale)
+    followed = training_line(track, line, car, settings.style)
+    columns = followed.x_m, followed.y_m, followed.vx_mps
+    law = PurePursuit(car, *columns, settings, room_m=room_beside(track, followed))
+    loop = ClosedLoop(car, track, line, PythonController(files.artefacts[0], law))
+    start = run_request(track, RunPlan(1, "", 0, duration_s, True, 0.1)).x0
+    return loop.drive(0, duration_s, x0=[*start[:6], TRIM])
+
+
+def seen(
+    driven: Driven,
+    path: Path,
+    mm: float,
+    degrees: float,
+    *,
+    stamped: bool = True,
+    gyro: bool = False,
+    pose: bool = True,
+    count: int | None = None,
+) -> Path:
+    """The log of a drive of which poses are reported a period late, but in gaps of 100 ms every
+    2 s, and 1 % of them nowhere near.
+
+    ``stamped``: with the time at which they were measured. ``gyro``: of whose readings the times
+    are a period late. ``count``: of states.
+    """
+    random = np.random.default_rng(0)
+    deviation = np.array([1e-3 * mm, 1e-3 * mm, np.deg2rad(degrees)])
+    late_s = driven.step_s if stamped else 0.0
+    with _log(path, driven) as write:
+        before = [None, *driven.true_x]
+        for state, x in zip(driven.states[:count], before, strict=False):
+            readings: list[Reading] = []
+            if x is not None and pose and (state.time_s + 1) % 2 > 0.1:
+                value = random.normal(x[:3], deviation)
+                value += (random.random() < 0.01) * random.normal(0, 0.3, 3)
+                readings = [reading("pose", state.time_s - late_s, "x y psi", value, deviation)]
+            if x is not None and gyro:
+                turn = np.array([random.normal(x[5] + GYRO_OFFSET, GYRO_NOISE)])
+                readings.append(reading("gyro", state.time_s, "omega", turn, [0.05]))
+            write(structs.replace(state, x=(0.0,) * 7, estimated=True, readings=tuple(readings)))
+    return path
+
+
+def plain(driven: Driven, path: Path, u: tuple[float, float] | None = (0.0, 0.0)) -> Path:
+    """The log with whole, exact states; ``u``: in place of what acted, unless it is zero; None:
+    what acted in a period long before."""
+    with _log(path, driven) as write:
+        for k, state in enumerate(driven.states):
+            acted = driven.states[k // 2].u_applied if u is None else u
+            write(state if acted == (0.0, 0.0) else structs.replace(state, u_applied=acted))
+    return path
+
+
+def reading(
+    instrument: str, time_s: float, of: str, value: Floats, deviation: Sequence[float] | Floats
+) -> Reading:
+    """One with such values."""
+    pairs = zip(value.tolist(), map(float, deviation), strict=True)
+    return Reading(
+        instrument=instrument, time_s=time_s, values=dict(zip(of.split(), pairs, strict=True))
+    )
+
+
+@contextmanager
+def _log(path: Path, driven: Driven) -> Iterator[Callable[[State], None]]:
+    log = LogWriter(path, {"collect": {"car": car_text(driven.car)}})
+    key = car_key(STATE.key, driven.car.name)
+
+    def write(state: State) -> None:
+        log.write(key, encode(state), state.source_time_ns)
+
+    yield write
+    log.close()
