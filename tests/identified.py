@@ -10,19 +10,31 @@ from msgspec import structs
 from rich.console import Console
 
 from bayesrace.arrays import Floats
+from bayesrace.codegen.build import build
+from bayesrace.codegen.settings import BuildSettings
+from bayesrace.controller.assembly import compiled_controller
 from bayesrace.controller.pure_pursuit import PurePursuit, PurePursuitSettings
 from bayesrace.controller.python_controller import PythonController
+from bayesrace.gp.weights import read_weights
+from bayesrace.integrators import PREDICTION
+from bayesrace.learning.sources import dataset_from_log
 from bayesrace.log import LogWriter
 from bayesrace.messages import STATE, Reading, State, car_key, encode
-from bayesrace.operation.closed_loop import ClosedLoop, Driven
-from bayesrace.operation.collect import room_beside, training_line
+from bayesrace.operation.closed_loop import ClosedLoop, Driven, built_in_car
+from bayesrace.operation.collect import collect, room_beside, training_line
 from bayesrace.operation.drive import RunPlan, run_request
-from bayesrace.operation.preparation import Prepared, prepare
+from bayesrace.operation.preparation import (
+    Prepared,
+    prepare,
+    trained_weights,
+    training_settings,
+)
 from bayesrace.operation.settings import PreparationSettings
 from bayesrace.operation.terminal.terminal import stages_on
-from bayesrace.vehicles import car_text, get_car
+from bayesrace.raceline import racing_line
+from bayesrace.vehicles import CarParameters, car_text, get_car
 
-__all__ = ["GYRO_NOISE", "GYRO_OFFSET", "TRIM", "exact", "plain", "prepared_for", "seen"]
+__all__ = ["GYRO_NOISE", "GYRO_OFFSET", "TRIM", "exact", "plain", "prepared_for", "raced", "seen"]
 
 TRIM = 0.02
 """Steering angle at a commanded angle of 0 [rad]."""
@@ -64,6 +76,7 @@ def seen(
     gyro: bool = False,
     pose: bool = True,
     count: int | None = None,
+    seed: int = 0,
 ) -> Path:
     """The log of a drive of which poses are reported a period late, but in gaps of 100 ms every
     2 s, and 1 % of them nowhere near.
@@ -71,7 +84,7 @@ def seen(
     ``stamped``: with the time at which they were measured. ``gyro``: of whose readings the times
     are a period late. ``count``: of states.
     """
-    random = np.random.default_rng(0)
+    random = np.random.default_rng(seed)
     deviation = np.array([1e-3 * mm, 1e-3 * mm, np.deg2rad(degrees)])
     late_s = driven.step_s if stamped else 0.0
     with _log(path, driven) as write:
@@ -87,6 +100,22 @@ def seen(
                 readings.append(reading("gyro", state.time_s, "omega", turn, [0.05]))
             write(structs.replace(state, x=(0.0,) * 7, estimated=True, readings=tuple(readings)))
     return path
+
+
+def raced(true: CarParameters, car: CarParameters, folder: Path) -> Driven:
+    """Three laps of ``true`` by a controller that knows ``car``, and has learned with it."""
+    files, settings = prepared_for(true.name), PreparationSettings(car=car)
+    assert files.training is not None
+    trained_on, artefact = files.training.driven_on.track, build(BuildSettings(car=car))[0]
+    line, log = racing_line(trained_on, car, settings.raceline), folder / "training.mcap"
+    vehicle = built_in_car(true)
+    collect(trained_on, line, car, artefact, log, 12.0, settings.pursuit, vehicle=vehicle)
+    samples = dataset_from_log(log, car, PREDICTION.step_s)
+    weights = read_weights(trained_weights(samples, PREDICTION, training_settings(settings)))
+    track = files.first.track
+    line = racing_line(track, car, settings.raceline)
+    controller = compiled_controller(artefact, car, track, line, weights)
+    return ClosedLoop(car, track, line, controller, vehicle=vehicle).drive(3)
 
 
 def plain(driven: Driven, path: Path, u: tuple[float, float] | None = (0.0, 0.0)) -> Path:

@@ -10,7 +10,7 @@ from bayesrace.vehicles import CarParameters, get_car, read_car, write_car
 from bayesrace.vehicles.parts import DcMotor
 from tests.cars import with_numbers
 from tests.command_line import Cli, refused
-from tests.identified import GYRO_NOISE, GYRO_OFFSET, TRIM, exact, plain, seen
+from tests.identified import GYRO_NOISE, GYRO_OFFSET, TRIM, exact, plain, raced, seen
 
 GUESS = {"cm1": 0.4, "cm2": 0.03, "cr0": 0.02, "cr2": 0.001, "friction": 0.5}
 """What a driver would write who knows the size of an orca only."""
@@ -84,6 +84,15 @@ def test_a_gyro_is_compared_with_the_poses(tmp_path: Path) -> None:
     near(found, "gyro late", 20.0, 0.05)
     near(found, "yaw rate offset", GYRO_OFFSET, 0.1)
     near(found, "gyro omega", GYRO_NOISE, 0.1)
+
+
+@pytest.mark.check
+def test_a_race_with_the_identified_car_loses_no_time(tmp_path: Path) -> None:
+    driven = exact("orca", 30.0)
+    found = found_in(seen(driven, tmp_path / "drive.mcap", 1.0, 0.5), guess(driven.car))
+    true, identified = (raced(driven.car, car, tmp_path) for car in (driven.car, found.car))
+    assert (identified.off_track_m <= 0).all()
+    assert identified.laps_s[1] < 1.005 * true.laps_s[1]
 
 
 def test_the_command_writes_a_file_that_all_others_read(cli: Cli, tmp_path: Path) -> None:
