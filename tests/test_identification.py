@@ -122,5 +122,9 @@ def test_drives_that_do_not_suffice_are_refused(cli: Cli, tmp_path: Path) -> Non
     refused(cli("identify", blind), "x, y and psi", "motion capture")
     held = plain(driven, tmp_path / "held.mcap", u=(0.4, 0.0))
     refused(cli("identify", held), "drive command hardly changes", "bayesrace collect")
-    wrong = plain(driven, tmp_path / "wrong.mcap", u=None)
+
+
+@pytest.mark.check
+def test_commands_that_do_not_move_the_car_are_refused(cli: Cli, tmp_path: Path) -> None:
+    wrong = plain(exact("orca", 12.0), tmp_path / "wrong.mcap", u=None)
     refused(cli("identify", wrong), "no such car", "--car")
