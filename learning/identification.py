@@ -233,12 +233,13 @@ class _Report:
         length_s = periods * fit.step_s
         late_s = fit.numbers(fit.theta[None])[1][0]
         windows = cut(fit.runs, periods, late_s)
-        curves, _ = polynomials(windows, 2, length_s)
+        curves, good = polynomials(windows, 2, length_s)
         x = states_of(curves, 0.5, length_s)
         numbers, _ = fit.numbers(fit.theta[None])
         poses = ((windows.weight > 0) & (windows.of == 0)).sum(axis=1)
         base = fit.track.base(windows)
         used = (poses > 4) & (x[3] > 0.2) & (np.abs(np.arctan2(x[4], x[3])) < MOST_SLIP_RAD)
+        used &= (good | (windows.weight <= 0)).all(axis=1)
         index = base[:, None] + np.arange(periods) - round(numbers.delay_s.item() / fit.step_s)
         d, angle = (one.mean(axis=1) for one in fit.track.commands(np.maximum(index, 0)))
         delta = numbers.gain * angle + numbers.offset_rad
