@@ -233,7 +233,7 @@ class _Report:
         length_s = periods * fit.step_s
         late_s = fit.numbers(fit.theta[None])[1][0]
         windows = cut(fit.runs, periods, late_s)
-        curves, good = polynomials(windows, 2, length_s)
+        curves, good = polynomials(windows, 2, length_s, alone=True)
         x = states_of(curves, 0.5, length_s)
         numbers, _ = fit.numbers(fit.theta[None])
         poses = ((windows.weight > 0) & (windows.of == 0)).sum(axis=1)

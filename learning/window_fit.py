@@ -329,9 +329,12 @@ def _solved(r: Floats, right: Floats) -> Floats:
     return np.asarray(np.nan_to_num(solved))
 
 
-def polynomials(windows: Windows, degree: int, length_s: float) -> tuple[Floats, Flags]:
+def polynomials(
+    windows: Windows, degree: int, length_s: float, *, alone: bool = False
+) -> tuple[Floats, Flags]:
     """Through x, y and psi of windows, over time from 0 to 1; (3, w, degree + 1), lowest power
-    first. And which readings are not far from them, (w, r)."""
+    first. And which readings are not far from them, (w, r); ``alone``: by the median of all
+    windows, where a curve is near to all that it should be."""
     powers = (windows.time_s / length_s)[..., None] ** np.arange(degree + 1)
     good = np.ones(windows.of.shape, bool)
     curves = np.zeros((3, len(good), degree + 1))
@@ -353,7 +356,12 @@ def polynomials(windows: Windows, degree: int, length_s: float) -> tuple[Floats,
             far = off > _FAR * np.maximum(
                 np.maximum(middle, ordinary), 1 / windows.weight.clip(1e-12)
             )
-            good = np.where(here, ~far, good)
+            if alone:
+                least = np.maximum(ordinary, 1 / windows.weight.clip(1e-12))
+                far = here & good & (off > _FAR * least)
+                good &= ~(far & (off == np.where(far, off, 0).max(axis=1, keepdims=True)))
+            else:
+                good = np.where(here, ~far, good)
     return curves, good
 
 
