@@ -173,7 +173,7 @@ class Driver:
             return self.controller.artefact.text(library.br_cycle_fault_text(fault))
         if not self.faulty:
             return "position and heading are not known well enough"
-        text = self.controller.artefact.text(library.br_instrument_fault_text(fault))
+        text = self.controller.artefact.text(library.br_estimator_fault_text(fault))
         return f"instrument '{self.faulty}': {text}"
 
     @property

@@ -124,6 +124,7 @@ def test_a_wheel_or_gyro_that_fails_is_named_and_the_car_drives_on(
     assert kind in kinds
     assert bad <= 5 + 4 or fault is stopped  # four readings come with a state
     assert {who for *_, who, _ in loop.named} == {"", which}
+    assert loop.driver.fault_text.startswith(f"instrument '{which}': ")
     assert set(driven.levels[10:]) == {Level.SOLUTION}
     counts = loop.driver.instruments[which]
     assert counts.refused + counts.lost + counts.left_out >= 5 or fault is stopped

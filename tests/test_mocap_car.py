@@ -46,8 +46,6 @@ class Bench:
         drives = controller or tuple(files.arguments)
         self.processes["controller"] = start(
             "controller",
-            "--car",
-            str(FOLDER / "car.toml"),
             *drives,
             "--endpoint",
             plant_at,

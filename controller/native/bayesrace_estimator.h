@@ -120,7 +120,7 @@ BR_API br_mpc_error br_estimator_read(const br_estimator *estimator, br_belief *
 BR_API const br_instrument *br_estimator_instrument(const br_estimator *estimator, int number);
 
 /* What speaks against an instrument, in words. */
-BR_API const char *br_instrument_fault_text(br_fault fault);
+BR_API const char *br_estimator_fault_text(br_fault fault);
 
 #ifdef __cplusplus
 }

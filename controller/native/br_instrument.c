@@ -158,7 +158,7 @@ br_fault br_estimator_blind(const br_estimator *estimator, int *contradicted) {
     return found;
 }
 
-const char *br_instrument_fault_text(br_fault fault) {
+const char *br_estimator_fault_text(br_fault fault) {
     static const char *const texts[] = {
         [BR_FAULT_NONE] = "what it measures is believed",
         [BR_FAULT_FROZEN] = "it repeats what it said before, though the car moves",

@@ -10,7 +10,6 @@ import math
 import socket
 import struct
 import sys
-from pathlib import Path
 
 from bayesrace.errors import InputError
 from bayesrace.plant.hardware import Hardware, Report
@@ -19,7 +18,6 @@ from bayesrace.plant.process_settings import PlantSettings
 from bayesrace.transport import Endpoints
 from bayesrace.vehicles import CarParameters, get_car
 
-HERE = Path(__file__).parent
 POSE = struct.Struct("!4d")  # clock of the cameras [s], x, y [m], heading [rad]
 COMMAND = struct.Struct("!3d")  # drive command, steering angle [rad], to be reached at [rad/s]
 DEVIATION = {"x": 0.0005, "y": 0.0005, "psi": math.radians(0.2)}  # of one pose
@@ -64,7 +62,7 @@ def address(text: str) -> tuple[str, int]:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--car", default=str(HERE / "car.toml"), help="built-in car, or its file")
+    parser.add_argument("--car", default="orca", help="built-in car, or its file")
     parser.add_argument("--poses", type=address, default="127.0.0.1:7500", help="they arrive here")
     parser.add_argument("--commands", type=address, default="127.0.0.1:7501", help="they go there")
     parser.add_argument("--endpoint", default="tcp/127.0.0.1:7447", help="of the controller's link")
