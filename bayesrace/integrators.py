@@ -24,6 +24,7 @@ __all__ = [
     "PREDICTION",
     "SCHEMES",
     "Discretisation",
+    "pose_from_velocities",
 ]
 
 Rate = Callable[[Any], Any]
@@ -61,7 +62,7 @@ PLANT_SUBSTEP_HZ: Final = 1000
 inside the tyres' stability limit at low speed."""
 
 
-def _pose_from_velocities(x: Any, velocities: Any, h: float) -> Any:
+def pose_from_velocities(x: Any, velocities: Any, h: Any) -> Any:
     """Pose after h when (vx, vy, omega) go linearly from those in x to ``velocities``.
 
     The heading is then a quadratic in time, and Simpson's rule gives the position to O(h^4).
@@ -165,7 +166,7 @@ class Discretisation(BaseModel):
         if x.size1() == 7:  # a model with velocities
             x_next[3:6] += e
             if self.pose == "interpolated":
-                x_next[:3] = _pose_from_velocities(x, x_next[3:6], step_s)
+                x_next[:3] = pose_from_velocities(x, x_next[3:6], step_s)
         return x_next
 
     def identity(self, model_name: str, car: CarParameters) -> str:

@@ -11,14 +11,18 @@ from numpy.typing import ArrayLike
 
 from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
+from bayesrace.learning.drives import Estimates
 from bayesrace.vehicles.parameters import CarParameters
 
-__all__ = ["ROUNDING", "Dataset", "concatenate", "dataset_from_arrays", "filter_dataset"]
+__all__ = ["ROUNDING", "SIGMAS", "Dataset", "concatenate", "dataset_from_arrays", "filter_dataset"]
 __all__ += ["left_out"]
 
 ROUNDING: Final = 1e-6
 """Permitted error of times, inputs and angles [SI units]; a plant in single precision errs by
 2.4e-7 at 5 rad/s."""
+
+SIGMAS: Final = 4.0
+"""Standard deviations that an estimate may be off by."""
 
 _MIRRORED_STATE: Final = np.array([1.0, -1.0, -1.0, 1.0, -1.0, -1.0, -1.0])
 _MIRRORED_INPUT: Final = np.array([1.0, -1.0])
@@ -31,8 +35,9 @@ class Dataset:
 
     ``x``, ``x_next`` (n, 7) = [x, y, psi, vx, vy, omega, delta] and ``u`` (n, 2) =
     [d, delta_rate], SI units; ``u`` is the input that acted during the period, ``delta`` the angle
-    at its start. ``dropped`` counts samples left out so far, by reason. Raises InputError for
-    shapes that do not fit or numbers that are not finite.
+    at its start. ``dropped`` counts samples left out so far, by reason; ``estimates``, where states
+    are estimated: how well they are known. Raises InputError for shapes that do not fit or numbers
+    that are not finite.
     """
 
     car: CarParameters
@@ -41,6 +46,7 @@ class Dataset:
     u: Floats
     x_next: Floats
     dropped: Mapping[str, int] = field(default_factory=dict, kw_only=True)
+    estimates: Estimates | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
         count = len(self.x) if np.ndim(self.x) else 0
@@ -54,9 +60,21 @@ class Dataset:
                 raise InputError(f"dataset: {name} row {row} is not finite; leave it out")
             array.setflags(write=False)
             object.__setattr__(self, name, array)
+        if self.estimates is not None:
+            known = self.estimates.deviation
+            if known.shape != (count, 4) or not (np.isfinite(known) & (known >= 0)).all():
+                raise InputError(
+                    f"dataset: deviation of shape {known.shape}, expected ({count}, 4), none of "
+                    "them negative"
+                )
 
     def __len__(self) -> int:
         return len(self.x)
+
+    @property
+    def deviation(self) -> Floats:
+        """Standard deviations (n, 4) as in :class:`~.drives.Estimates`; zeros without."""
+        return (self.estimates or Estimates.exact(len(self))).deviation
 
     @property
     def features(self) -> Floats:
@@ -66,7 +84,13 @@ class Dataset:
     def select(self, rows: slice | ArrayLike, reason: str = "") -> "Dataset":
         """The given rows (slice, mask or indices); others are counted under ``reason``, if any."""
         index = rows if isinstance(rows, slice) else np.asarray(rows)
-        kept = replace(self, x=self.x[index], u=self.u[index], x_next=self.x_next[index])
+        kept = replace(
+            self,
+            x=self.x[index],
+            u=self.u[index],
+            x_next=self.x_next[index],
+            estimates=None if self.estimates is None else self.estimates.select(index),
+        )
         lost = len(self) - len(kept) if reason else 0
         return replace(kept, dropped=Counter(self.dropped) + Counter({reason: lost}))
 
@@ -81,13 +105,22 @@ class Dataset:
             x=both(self.x, _MIRRORED_STATE),
             u=both(self.u, _MIRRORED_INPUT),
             x_next=both(self.x_next, _MIRRORED_STATE),
+            estimates=self.estimates and self.estimates.select(np.repeat(np.arange(len(self)), 2)),
         )
+
+    def settled(self) -> "Dataset":
+        """The same samples without their drives: they stay as they are smoothed."""
+        if self.estimates is None:
+            return self
+        settled = Estimates.exact(len(self))
+        return replace(self, estimates=replace(settled, deviation=self.deviation))
 
     def digest(self) -> str:
         """sha256 over car, step and samples."""
         text = f"{self.car.name}/{self.car.digest()}/{self.step_s!r}/{len(self)}"
         total = hashlib.sha256(text.encode())
-        for array in (self.x, self.u, self.x_next):
+        known = [] if self.estimates is None else [self.deviation]
+        for array in (self.x, self.u, self.x_next, *known):
             total.update(array.astype("<f8", order="C").tobytes())
         return total.hexdigest()
 
@@ -126,27 +159,36 @@ def concatenate(datasets: Sequence[Dataset]) -> Dataset:
         x=np.concatenate([dataset.x for dataset in datasets]),
         u=np.concatenate([dataset.u for dataset in datasets]),
         x_next=np.concatenate([dataset.x_next for dataset in datasets]),
+        estimates=_joined(datasets),
         dropped=sum((Counter(dataset.dropped) for dataset in datasets), Counter[str]()),
     )
+
+
+def _joined(datasets: Sequence[Dataset]) -> Estimates | None:
+    if all(one.estimates is None for one in datasets):
+        return None
+    return Estimates.joined([one.estimates or Estimates.exact(len(one)) for one in datasets])
 
 
 def filter_dataset(dataset: Dataset, *, limits: bool = True) -> Dataset:
     """Leaves out standstill, samples outside the car's limits, those of a spin, and steering that
     does not add up.
 
-    Slower than ``moving_mps`` of its tuning the car stands; all else is up to :data:`ROUNDING`. The
-    last means delta_{k+1} != delta_k + step * delta_rate. Without ``limits``, samples outside the
+    Slower than ``moving_mps`` of its tuning the car stands; all else is up to :data:`ROUNDING`, and
+    angles that are estimated up to :data:`SIGMAS` of their standard deviations. The last means
+    delta_{k+1} != delta_k + step * delta_rate. Without ``limits``, samples outside the
     car's limits and those of a spin stay.
     """
     car = dataset.car
     kept = dataset.select(dataset.x[:, 3] >= car.tuning.gate.moving_mps, "standstill")
     d, rate = kept.u.T
+    tolerance = ROUNDING + SIGMAS * kept.deviation[:, 3]
     angle = np.maximum(np.abs(kept.x[:, 6]), np.abs(kept.x_next[:, 6]))
     within = (
         (d >= car.d_min - ROUNDING)
         & (d <= car.d_max + ROUNDING)
         & (np.abs(rate) <= car.delta_rate_max_radps + ROUNDING)
-        & (angle <= car.delta_max_rad + ROUNDING)
+        & (angle <= car.delta_max_rad + tolerance)
     )
     if limits:
         kept = kept.select(within, "outside limits")
@@ -154,4 +196,5 @@ def filter_dataset(dataset: Dataset, *, limits: bool = True) -> Dataset:
         vx, vy = kept.x[:, 3:5].T
         kept = kept.select(np.abs(np.arctan2(vy, vx)) <= car.tuning.gate.spin_rad, "spinning")
     drift = kept.x_next[:, 6] - kept.x[:, 6] - kept.step_s * kept.u[:, 1]
-    return kept.select(np.abs(drift) <= ROUNDING, "steering does not match its rate")
+    tolerance = ROUNDING + SIGMAS * kept.deviation[:, 3]
+    return kept.select(np.abs(drift) <= tolerance, "steering does not match its rate")

@@ -98,13 +98,16 @@ class Covariance:
 class Posterior:
     """The GP after seeing targets ``y`` (n,) at features ``z`` (n, 6); n may be 0.
 
-    InputError if the covariance of the samples is singular.
+    ``known``: variances (n,) that the targets have besides the covariance's noise. InputError if
+    the covariance of the samples is singular.
     """
 
-    def __init__(self, covariance: Covariance, z: Floats, y: Floats) -> None:
+    def __init__(
+        self, covariance: Covariance, z: Floats, y: Floats, known: Floats | float = 0.0
+    ) -> None:
         self._covariance, self._z = covariance, z
         matrix = covariance.between(z, z)
-        matrix[np.diag_indices_from(matrix)] += covariance.noise
+        matrix[np.diag_indices_from(matrix)] += covariance.noise + known
         try:
             self._factor = cholesky(matrix, lower=True, overwrite_a=True)
         except np.linalg.LinAlgError as error:
@@ -163,16 +166,19 @@ class PairDistances:
         """(p, n (n + 1) / 2), packed."""
 
 
-def likelihood(kind: str, pairs: PairDistances, y: Floats, theta: Floats) -> tuple[float, Floats]:
+def likelihood(
+    kind: str, pairs: PairDistances, y: Floats, theta: Floats, known: Floats | float = 0.0
+) -> tuple[float, Floats]:
     """log p(y | z, theta) for pairs of scaled features and scaled targets ``y`` (n,), and its
-    gradient (p + 2,); -inf and zeros where K is numerically singular."""
+    gradient (p + 2,); -inf and zeros where K is numerically singular. ``known``: variances (n,)
+    besides the noise in theta."""
     count, diagonal, squares = pairs.count, pairs.diagonal, pairs.squares
     signal, noise = math.exp(theta[0]), math.exp(theta[-1])
     precision = np.exp(-2 * theta[1:-1])
     r2 = precision @ squares
     k = kernel(kind, r2)
     packed = signal * k
-    packed[diagonal] += noise
+    packed[diagonal] += noise + known
     matrix, _ = lapack.dtpttf(count, packed, uplo="L")
     factor, failed = lapack.dpftrf(count, matrix, uplo="L", overwrite_a=1)
     if failed:
@@ -230,16 +236,18 @@ def maximise(
     tolerance: float = TOLERANCE,
     *,
     isotropic: bool = False,
+    known: Floats | float = 0.0,
 ) -> Fit:
     """L-BFGS-B from ``start`` within :data:`BOUNDS`, at most ``iterations`` iterations.
 
-    ``isotropic``: all features share one length scale, at the start the first one's.
+    ``known``: as of :func:`likelihood`. ``isotropic``: all features share one length scale, at the
+    start the first one's.
     """
     spread = _ISOTROPIC if isotropic else np.eye(len(BOUNDS))
     searched = spread.argmax(axis=0)
 
     def objective(point: Floats) -> tuple[float, Floats]:
-        value, gradient = _cost(kind, pairs, y, spread @ point)
+        value, gradient = _cost(kind, pairs, y, spread @ point, known)
         return value, gradient @ spread
 
     result = minimize(
@@ -255,7 +263,12 @@ def maximise(
 
 
 def refine(
-    pairs: PairDistances, y: Floats, rough: Fit, iterations: int, tolerance: float = TOLERANCE
+    pairs: PairDistances,
+    y: Floats,
+    rough: Fit,
+    iterations: int,
+    tolerance: float = TOLERANCE,
+    known: Floats | float = 0.0,
 ) -> Fit:
     """SLSQP from a fit to some of the samples within :data:`BOUNDS`, at most ``iterations``."""
     values, vectors = np.linalg.eigh(rough.inverse_hessian)
@@ -265,7 +278,7 @@ def refine(
         return np.asarray(np.clip(rough.theta + metric @ point, *BOUNDS.T))
 
     def objective(point: Floats) -> tuple[float, Floats]:
-        value, gradient = _cost(rough.kind, pairs, y, theta(point))
+        value, gradient = _cost(rough.kind, pairs, y, theta(point), known)
         return value, gradient @ metric
 
     result = minimize(
@@ -280,10 +293,12 @@ def refine(
     return Fit(rough.kind, theta(result.x), best, rough.inverse_hessian)
 
 
-def _cost(kind: str, pairs: PairDistances, y: Floats, theta: Floats) -> tuple[float, Floats]:
+def _cost(
+    kind: str, pairs: PairDistances, y: Floats, theta: Floats, known: Floats | float
+) -> tuple[float, Floats]:
     """Negative log likelihood per sample, so that tolerances do not depend on how many there are,
     and its gradient."""
-    value, gradient = likelihood(kind, pairs, y, theta)
+    value, gradient = likelihood(kind, pairs, y, theta, known)
     if not math.isfinite(value):
         return _WORST, np.zeros_like(theta)
     return -value / len(y), -gradient / len(y)

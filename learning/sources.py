@@ -3,8 +3,9 @@
 A file of arrays (``.npz``, made by ``numpy.savez``; reading executes nothing) holds ``car`` (a
 built-in name, or all values as JSON), ``step_s`` [s], and either single samples, ``x`` (n, 7),
 ``u`` (n, 2), ``x_next`` (n, 7), or one unbroken drive, ``states`` (n + 1, 7), ``inputs`` (n, 2), as
-:class:`bayesrace.learning.dataset.Dataset` describes them. Any other array is refused: it may be a
-misspelt one.
+:class:`bayesrace.learning.dataset.Dataset` describes them. Single samples that are estimated have
+their ``deviation`` (n, 4) (:class:`bayesrace.learning.drives.Estimates`). Any other array is
+refused: it may be a misspelt one.
 
 The published form, the drives of the paper's code, is read as well: ``states`` (6 or 7, n + 1),
 their rates ``dstates``, ``inputs`` (2, n) with duty cycle and **steering angle**, any other arrays,
@@ -32,7 +33,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from bayesrace.arrays import AnyArray, Flags
-from bayesrace.columns import Columns, LogColumns, with_estimates
+from bayesrace.columns import Columns, LogColumns
 from bayesrace.errors import InputError, faults_in
 from bayesrace.integrators import PREDICTION, Discretisation
 from bayesrace.learning.dataset import (
@@ -42,6 +43,8 @@ from bayesrace.learning.dataset import (
     dataset_from_arrays,
     filter_dataset,
 )
+from bayesrace.learning.drives import Estimates
+from bayesrace.learning.smoothing import smoothed_states
 from bayesrace.log import LogReader
 from bayesrace.messages import STATE, TELEMETRY, TRUTH, topic_of
 from bayesrace.vehicles import CarParameters, builtin_cars, car_text, described_car
@@ -61,7 +64,7 @@ T = TypeVar("T")
 
 TRUE_STATES: Final = "seq run time_s x u_applied"
 """Columns of the true states that samples can be made of, ..."""
-STATES: Final = f"{TRUE_STATES} estimated"
+STATES: Final = f"{TRUE_STATES} estimated readings"
 """... of those that a controller sees ..."""
 CYCLES: Final = "run state_seq fallback sensor_fault estimate"
 """... and of the telemetry, which says what is left out of them, and what was estimated."""
@@ -141,12 +144,13 @@ def dataset_from_columns(
     ``cycles`` has the columns :data:`CYCLES`. Left out are the states in whose cycles the
     fallback acted, and those that were not believed, with the states just before, which may be as
     wrong. The input of sample k is ``u_applied`` of the state after it, which acted, not the
-    requested one. A missing state is counted as "gap". ``limits``: as of
+    requested one. States that are to be estimated are smoothed (:mod:`~.smoothing`), and those that
+    nothing was read for are left out. A missing state is counted as "gap". ``limits``: as of
     :func:`~bayesrace.learning.dataset.filter_dataset`.
     """
     if runs is not None:
         states = states[np.isin(states["run"], list(runs))]
-    states = with_estimates(states, cycles)
+    states, estimates = smoothed_states(states, cycles, car, step_s)
     now, after = states[:-1], states[1:]
     passed_s = after["time_s"] - now["time_s"]
     # A fault of the plant repeats the last state: no time has passed.
@@ -165,10 +169,12 @@ def dataset_from_columns(
             "drove: --artefact"
         )
     gaps = int(pair.sum() - found.sum())
+    estimates = estimates and estimates.select(np.flatnonzero(found))
     now, after = now[found], after[found]
     samples = Dataset(
-        car, step_s, now["x"], after["u_applied"], after["x"], dropped={"gap": gaps} if gaps else {}
-    )
+        car, step_s, now["x"], after["u_applied"], after["x"],
+        dropped={"gap": gaps} if gaps else {}, estimates=estimates,
+    )  # fmt: skip
     return filter_dataset(samples.select(~_left_out(now, cycles), "fallback"), limits=limits)
 
 
@@ -221,9 +227,10 @@ def dataset_from_npz(
 def write_npz(path: Path, dataset: Dataset) -> None:
     """The samples as :func:`dataset_from_npz` reads them."""
     car, step_s = np.array(car_text(dataset.car)), np.array(dataset.step_s)
-    np.savez_compressed(
-        path, car=car, step_s=step_s, x=dataset.x, u=dataset.u, x_next=dataset.x_next
-    )
+    arrays: dict[str, Any] = {"x": dataset.x, "u": dataset.u, "x_next": dataset.x_next}
+    if dataset.estimates is not None:
+        arrays["deviation"] = dataset.deviation
+    np.savez_compressed(path, car=car, step_s=step_s, **arrays)
 
 
 def _read(path: Path) -> "_File":
@@ -277,14 +284,19 @@ class _File:
 
     def _own(self) -> Dataset:
         names = set(self.arrays)
-        if self.car is None or names not in ({*_ABOUT, *_SAMPLES}, {*_ABOUT, *_DRIVE}):
+        forms = [{*_ABOUT, *one} for one in (_SAMPLES, (*_SAMPLES, "deviation"), _DRIVE)]
+        if self.car is None or names not in forms:
             raise InputError(f"arrays {', '.join(sorted(names)) or 'none'}; {_SCHEMA}")
         (step_s,) = self._numbers("step_s")
         if step_s.shape != () or not 0 < step_s <= 1:
             raise InputError("'step_s' must be one number of seconds, above 0 and at most 1")
         if "states" in names:
             return dataset_from_arrays(self.car, float(step_s), *self._numbers(*_DRIVE))
-        return Dataset(self.car, float(step_s), *self._numbers(*_SAMPLES))
+        known = None
+        if "deviation" in names:
+            (deviation,) = self._numbers("deviation")
+            known = replace(Estimates.exact(len(deviation)), deviation=deviation)
+        return Dataset(self.car, float(step_s), *self._numbers(*_SAMPLES), estimates=known)
 
     def _is_published(self) -> bool:
         if not self.arrays.keys() >= {*_DRIVE} or self.arrays.keys() & {*_ABOUT}:

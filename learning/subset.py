@@ -55,13 +55,13 @@ def evenly(count: int, wanted: int) -> Rows:
 
 
 def most_informative(
-    kind: str, z: Floats, length_scales: Floats, noise_ratio: float, wanted: int
+    kind: str, z: Floats, length_scales: Floats, noise_ratio: Floats | float, wanted: int
 ) -> Rows:
     """Indices of ``wanted`` samples, each of largest posterior variance given those before it.
 
-    A pivoted Cholesky factorisation: O(n wanted^2) time, O(n wanted) memory. ``noise_ratio`` is
-    noise over signal variance. Sorted: samples stay in the order in which they were driven.
-    InputError if that memory would be more than 4 GB.
+    A pivoted Cholesky factorisation: O(n wanted^2) time, O(n wanted) memory. ``noise_ratio``, one
+    for all or (n,), is noise over signal variance. Sorted: samples stay in the order in which they
+    were driven. InputError if that memory would be more than 4 GB.
     """
     count = len(z)
     if count <= wanted:
@@ -72,7 +72,7 @@ def most_informative(
             "memory; give fewer samples, or choose fewer"
         )
     scaled = z / length_scales
-    variance = np.ones(count)
+    variance, noise = np.ones(count), np.broadcast_to(noise_ratio, count)
     columns = np.zeros((wanted, count))
     chosen = np.zeros(wanted, dtype=np.int64)
     for step in range(wanted):
@@ -80,7 +80,7 @@ def most_informative(
         chosen[step] = pivot
         column = kernel(kind, cdist(scaled[pivot : pivot + 1], scaled, "sqeuclidean")[0])
         column -= columns[:step, pivot] @ columns[:step]
-        column /= np.sqrt(max(variance[pivot], 0.0) + noise_ratio)
+        column /= np.sqrt(max(variance[pivot], 0.0) + noise[pivot])
         columns[step] = column
         variance -= column**2
         variance[pivot] = -np.inf

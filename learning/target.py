@@ -107,26 +107,31 @@ class Target:
     """Features ``z`` (n, 6) and one output's residual ``y`` (n,), both standardised.
 
     Each column is in units of its standard deviation (``z_scale`` (6,), ``y_scale``) about its
-    mean. ``folds`` (n,) numbers what cross-validation leaves out together.
+    mean. ``folds`` (n,) numbers what cross-validation leaves out together. ``known`` (n,):
+    variances of ``y``, where states are estimated; else 0.
     """
 
     name: str
     z: Floats
     y: Floats
     folds: Rows
+    known: Floats
     z_scale: Floats
     y_mean: float
     y_scale: float
 
     @classmethod
-    def of(cls, name: str, z: Floats, y: Floats, folds: Rows) -> "Target":
-        """From features and residual in SI units."""
+    def of(
+        cls, name: str, z: Floats, y: Floats, folds: Rows, deviation: Floats | float = 0.0
+    ) -> "Target":
+        """From features and residual, with its deviation, in SI units."""
         z_scale, y_mean, y_scale = z.std(axis=0), float(y.mean()), float(y.std())
         return cls(
             name=name,
             z=(z - z.mean(axis=0)) / z_scale,
             y=(y - y_mean) / y_scale,
             folds=folds,
+            known=np.broadcast_to((np.asarray(deviation) / y_scale) ** 2, y.shape),
             z_scale=z_scale,
             y_mean=y_mean,
             y_scale=y_scale,
@@ -134,7 +139,7 @@ class Target:
 
     def select(self, rows: Rows, folds: Rows) -> "Target":
         """The given samples, in units of all, with other ``folds``."""
-        return replace(self, z=self.z[rows], y=self.y[rows], folds=folds)
+        return replace(self, z=self.z[rows], y=self.y[rows], folds=folds, known=self.known[rows])
 
     def theta_of(self, output: GpOutput) -> Floats:
         """Hyperparameters of earlier weights in the units of this target."""
@@ -148,12 +153,18 @@ class Target:
         """Samples that GPs are judged by."""
         return evenly(len(self.y), _TESTS)
 
+    def posterior(self, rows: Rows, covariance: Covariance) -> Posterior:
+        """The GP after seeing these samples."""
+        return Posterior(covariance, self.z[rows], self.y[rows], self.known[rows])
+
     def errors_from(self, rows: Rows, covariance: Covariance) -> PredictionErrors:
         """Errors at the tests, each predicted from the samples ``rows`` of all other folds."""
         tests = self.tests
-        posterior = Posterior(covariance, self.z[rows], self.y[rows])
+        posterior = self.posterior(rows, covariance)
         own = self.folds[tests]
         mean, sigma = posterior.predict_without(self.folds[rows], self.z[tests], own)
+        if (known := self.known[tests]).any():
+            sigma = np.sqrt(sigma**2 + known)
         return PredictionErrors(self.y[tests] - mean, sigma)
 
     def metrics(self, errors: PredictionErrors) -> dict[str, float]:

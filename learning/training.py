@@ -24,6 +24,7 @@ else.
 """
 
 import hashlib
+import math
 import multiprocessing
 import os
 import signal
@@ -57,12 +58,12 @@ from bayesrace.learning.dataset import Dataset, concatenate, left_out
 from bayesrace.learning.gaussian_process import (
     Fit,
     PairDistances,
-    Posterior,
     maximise,
     refine,
     starts,
 )
 from bayesrace.learning.settings import MIN_SAMPLES, Progress, TrainingSettings
+from bayesrace.learning.smoothing import smoothed_again
 from bayesrace.learning.subset import bounded, evenly, most_informative, spans, stretches
 from bayesrace.learning.target import KernelScore, Target
 from bayesrace.learning.validation import identity, residual
@@ -79,6 +80,10 @@ _CONSTANT: Final = 1e-9
 _THINNED: Final = 3
 """One in so many samples shows where the optimum is."""
 
+_ROUNDS: Final = 4
+_GAIN: Final = 1e-3
+"""Of the mean log likelihood of a reading, for which drives are smoothed once more."""
+
 _CHECKED: Final = 200
 """Samples that go with the weights, for a controller to check them by."""
 
@@ -90,6 +95,8 @@ class Training:
     weights: GpWeights
     kernels: tuple[KernelScore, ...]
     """Every candidate of every output, on the samples that hyperparameters are found with."""
+    samples: Dataset
+    """Learned from: the given ones, smoothed again where states are estimated."""
 
 
 def train(
@@ -118,17 +125,59 @@ def fit(
     model.
     """
     settings, report = settings or TrainingSettings(), progress or (lambda share, text: None)
-    model, errors = identity(dataset, discretisation), residual(dataset, discretisation)
+    widen, model = 1.0 if initial else settings.widen, identity(dataset, discretisation)
     if initial is not None and initial.discretisation != model:
         raise InputError(
             f"GP training: cannot start from weights for {initial.discretisation}, this is {model}"
         )
+    if dataset.estimates is not None and dataset.estimates.drives:
+        dataset = _smoothed(dataset, discretisation, settings, initial, report)
+    return _fit(dataset, discretisation, settings, initial, widen, report)
+
+
+def _smoothed(
+    dataset: Dataset,
+    discretisation: Discretisation,
+    settings: TrainingSettings,
+    weights: GpWeights | None,
+    report: Progress,
+) -> Dataset:
+    """The samples smoothed and learned from in turn, as long as that makes it more likely what was
+    read in the drives; ``weights``: that drove, to begin with.
+
+    Smoothing takes the model's errors for noise of each step. So variances are not widened here,
+    and what smoothing leaves unknown counts as noise (:func:`_learned`): else the model would
+    confirm itself, surer each time.
+    """
+    score = -math.inf
+    for _ in range(_ROUNDS):
+        if weights is None or score > -math.inf:
+            weights = _fit(dataset, discretisation, settings, weights, 1.0, report).weights
+        again, found = smoothed_again(dataset, discretisation, weights)
+        if found <= score + _GAIN:
+            break
+        dataset, score = again, found
+    return dataset
+
+
+def _fit(
+    dataset: Dataset,
+    discretisation: Discretisation,
+    settings: TrainingSettings,
+    initial: GpWeights | None,
+    widen: float,
+    report: Progress,
+) -> Training:
+    """One training on these samples; ``widen`` as in the settings."""
+    model, errors = identity(dataset, discretisation), residual(dataset, discretisation)
     _check(dataset, errors)
     samples = dataset.with_mirror_images() if dataset.car.mirrored_samples else dataset
     images = len(samples) // len(dataset)
     folds = np.repeat(stretches(dataset, settings.folds), images)
-    columns = zip(OUTPUTS, residual(samples, discretisation).T, strict=True)
-    targets = [Target.of(name, samples.features, column, folds) for name, column in columns]
+    columns = zip(
+        OUTPUTS, residual(samples, discretisation).T, samples.deviation.T[:3], strict=True
+    )
+    targets = [Target.of(name, samples.features, y, folds, spread) for name, y, spread in columns]
     rows = evenly(len(samples), settings.hyper_points)
     if images == 2 and len(samples) >= 2 * len(rows):
         rows = rows - rows % 2 + np.arange(len(rows)) % 2  # a sample and an image in turn
@@ -145,9 +194,9 @@ def fit(
             kernels += scores
             kept = most_informative(
                 chosen.kind, target.z, chosen.covariance.lengths,
-                chosen.covariance.noise / chosen.covariance.signal, settings.capacity,
+                (chosen.covariance.noise + target.known) / chosen.covariance.signal,
+                settings.capacity,
             )  # fmt: skip
-            widen = 1.0 if initial is not None else settings.widen
             output, measured = _learned(target, chosen, kept, samples.features[kept], widen)
             outputs.append(output)
             metrics |= measured
@@ -172,7 +221,7 @@ def fit(
         created_utc_ns=time.time_ns(),
         program=f"bayesrace {__version__}",
     )
-    return Training(weights, tuple(kernels))
+    return Training(weights, tuple(kernels), dataset)
 
 
 def _check(dataset: Dataset, errors: Floats) -> None:
@@ -209,9 +258,10 @@ def _optimise(
         for guess in guesses:
             if ended.is_set():
                 raise InterruptedError
-            rough.append(maximise(kind, few, target.y[some], guess, *limits))
+            known = target.known[some]
+            rough.append(maximise(kind, few, target.y[some], guess, *limits, known=known))
         found = max(rough, key=lambda fit: fit.log_likelihood)
-        return refine(pairs, target.y, found, *limits)
+        return refine(pairs, target.y, found, *limits, known=target.known)
 
     usual = starts(settings.restarts if initial is None else 0, settings.seed)
     tasks = []
@@ -246,9 +296,9 @@ def _learned(
         kernel=fit.kind,
         length_scales=covariance.lengths * target.z_scale,
         signal_variance=covariance.signal * scale,
-        noise_variance=covariance.noise * scale,
+        noise_variance=(covariance.noise + float(target.known.mean())) * scale,
         inputs=inputs,
-        alpha=Posterior(covariance, target.z[rows], target.y[rows]).alpha / scale,
+        alpha=target.posterior(rows, covariance).alpha / scale,
         y_mean=target.y_mean,
         y_scale=target.y_scale,
     )
@@ -302,10 +352,11 @@ def perform(
     before = None if initial is None else read_weights(initial)
     weights, error = None, ""
     try:
-        weights = train(every, discretisation, settings, before)
+        made = fit(every, discretisation, settings, before)
+        weights, every = made.weights, made.samples
     except (InputError, ArithmeticError, ValueError) as reason:  # LinAlgError is a ValueError
         error = str(reason) or type(reason).__name__
-    kept = bounded(every, keep, weights or before)
+    kept = bounded(every, keep, weights or before).settled()
     return Outcome(error, weights, len(every), kept, time.monotonic() - begin_s)
 
 

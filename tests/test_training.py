@@ -138,11 +138,11 @@ def test_training_that_is_interrupted_begins_nothing_more(
 ) -> None:
     begun, interruption = [], threading.Event()
 
-    def counted(*arguments: Any) -> Fit:
+    def counted(*arguments: Any, **known: Any) -> Fit:
         begun.append(arguments[0])
         if len(begun) > 12:
             interruption.wait(60)
-        return maximise(*arguments)
+        return maximise(*arguments, **known)
 
     def interrupted(share: float, text: str) -> None:
         interruption.set()

@@ -175,6 +175,9 @@ class Collector:
             lap.versions, lap.fallbacks = list(stretch.versions), len(fallbacks)
             if samples is not None:
                 lap.samples, lap.left_out = len(samples), samples.dropped
-            if self._track is not None:
-                path = self._track.project_path(np.array([state.x[:2] for state in states]))
+            if self._track is not None and not (samples is None and states[0].estimated):
+                xy_m = np.array([state.x[:2] for state in states if not state.estimated])
+                if samples is not None and samples.estimates is not None:
+                    xy_m = samples.x[:, :2]
+                path = self._track.project_path(xy_m)
                 lap.off_track_m = max(float(np.max(path.off_track_m)), 0.0)

@@ -1,0 +1,433 @@
+"""States of a drive from what instruments have read in it, all of them used for every state.
+
+A controller's estimate at a moment uses what was read before; learning can use what was read after
+it as well. A forward pass is the extended Kalman filter of controller/native/br_estimator.c (nine
+numbers: the states, and the offsets of the measured yaw rate and steering angle; the same gate), in
+order of measurement, so that no reading is late. A backward pass, Rauch, Tung and Striebel's, takes
+in what came later (Särkkä, "Bayesian Filtering and Smoothing", section 9.1): with the gain
+
+    G_k = P_k F_k' P_(k+1|k)^-1
+
+    x_(k|K) = x_k + G_k (x_(k+1|K) - x_(k+1|k)),
+    P_(k|K) = P_k + G_k (P_(k+1|K) - P_(k+1|k)) G_k',    P_(k+1,k|K) = P_(k+1|K) G_k'.
+
+Two models predict. **Without weights** no model of the car does: the pose follows from the
+velocities, and these are twice integrated random walks in the car's frame (white jerk), as noisy as
+makes the readings most likely. The nominal model would bend the velocities to its own error, which
+is just what is to be learned. **With weights** it is the corrected model, with the variance that
+the weights state and the walk of ``car.tuning.estimator``, linearised along the first result.
+
+Steering that no instrument reads is what was commanded, from what is known of it at the start.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+from typing import Any, Final
+
+import casadi as ca
+import numpy as np
+from scipy.stats import chi2
+
+from bayesrace.arrays import Floats, Rows
+from bayesrace.columns import Columns, with_estimates
+from bayesrace.gp.expression import mean_function
+from bayesrace.gp.weights import GpWeights
+from bayesrace.integrators import PREDICTION, Discretisation, pose_from_velocities
+from bayesrace.learning.dataset import ROUNDING, Dataset
+from bayesrace.learning.drives import Drive, Estimates, Event, Measured
+from bayesrace.learning.validation import NOMINAL, predictive_sigma
+from bayesrace.vehicles.parameters import CarParameters
+from bayesrace.vehicles.parts import GRAVITY_MPS2
+
+__all__ = ["Smoothed", "smooth", "smoothed_again", "smoothed_states"]
+
+_NX: Final = 7
+_NB: Final = 9
+_VAGUE: Final = 10.0
+"""Times the tuning's deviations of a start from rest: a drive may begin at speed."""
+_JERK_S: Final = 0.1
+"""In which accelerations change by their full range: the middle of the search."""
+_SEARCHED: Final = 600
+"""Events of a drive that the noise of the random walk is found by."""
+_EXCEEDED: Final = {n: float(chi2.ppf(0.999, n)) for n in range(1, _NX + 1)}
+"""Squared distances that one of 1,000 right readings exceeds, as in the C code."""
+_LINEARISED: Final = 2
+"""Passes along the result of the one before."""
+
+
+@dataclass(frozen=True, eq=False)
+class Smoothed:
+    """Of the states ``rows`` (m,) of a drive, those from its first pose on."""
+
+    rows: Rows
+    x: Floats
+    """(m, 9)"""
+    covariance: Floats
+    """(m, 9, 9)"""
+    cross: Floats
+    """(m - 1, 9, 9): of each state with the one before, in this order."""
+    log_likelihood: float
+    """Of the readings, each predicted from those before."""
+    path: Floats
+    """All that was smoothed at every event, (e, 9 or more)."""
+
+    def step_variance(self, slope: Floats) -> Floats:
+        """Variances (m - 1, 3) of x_(k+1) - f(x_k, u_k) for vx, vy, omega, where f has these
+        derivatives (m - 1, 7, 7)."""
+        rows = slope[:, 3:6]
+        p, own = self.covariance[:-1, :_NX, :_NX], self.covariance[1:, :_NX, :_NX]
+        both = np.einsum("nij,njk->nik", rows, self.cross[:, 3:6, :_NX].transpose(0, 2, 1))
+        found = np.einsum("nij,njk,nik->ni", rows, p, rows)
+        found += np.einsum("nii->ni", own[:, 3:6, 3:6] - 2 * both)
+        return np.asarray(np.maximum(found, 0))
+
+
+# Filter and smoother -----------------------------------------------------------------------------
+
+_Transition = Callable[[int, Floats], tuple[Floats, Floats, Floats]]
+"""Event i and x (b, m) at the one before to x, its derivatives (.., m, m), added covariance."""
+
+
+@dataclass(eq=False)
+class _Forward:
+    """What the filter has found, for b variants side by side."""
+
+    x: Floats  # (e, b, m), after each event
+    p: Floats  # (e, b, m, m)
+    ahead: Floats  # (e, b, m), before each event
+    p_ahead: Floats  # (e, b, m, m)
+    f: Floats  # (e, b, m, m), from the event before
+    likelihood: Floats  # (b,)
+
+
+def _forward(
+    events: Sequence[Event], x0: Floats, p0: Floats, go: _Transition, gate: float
+) -> _Forward:
+    """The filter from ``x0`` (b, m) and ``p0`` (b, m, m) after the first event on."""
+    (b, m), e = x0.shape, len(events)
+    means, covariances = np.zeros((2, e, b, m)), np.zeros((3, e, b, m, m))
+    made = _Forward(means[0], covariances[0], means[1], covariances[1], covariances[2], np.zeros(b))
+    x, p = x0, p0
+    made.x[0], made.p[0] = x, p
+    for i in range(1, e):
+        event = events[i]
+        if event.duration_s > 0:
+            x, f, q = go(i, x)
+            p = f @ p @ np.swapaxes(f, -1, -2) + q
+            made.f[i] = f
+        else:
+            made.f[i] = np.eye(m)
+        made.ahead[i], made.p_ahead[i] = x, p
+        if event.measured is not None:
+            x, p = _updated(x, p, event.measured, gate, made.likelihood)
+        made.x[i], made.p[i] = x, p
+    return made
+
+
+def _updated(
+    x: Floats, p: Floats, measured: Measured, gate: float, likelihood: Floats
+) -> tuple[Floats, Floats]:
+    """With a reading, where the gate lets it pass; adds to the likelihoods (b,)."""
+    of, m = measured.states, x.shape[1]
+    h, r = _observation(of, m), np.diag(measured.variance)
+    hp = h @ p
+    s = hp @ h.T + r
+    new = measured.value - x @ h.T
+    if 2 in of:
+        k = of.index(2)
+        new[:, k] = np.remainder(new[:, k] + np.pi, 2 * np.pi) - np.pi
+    weighted = np.linalg.solve(s, np.concatenate([new[..., None], hp], axis=2))
+    squared = np.einsum("bi,bi->b", new, weighted[..., 0])
+    limit = gate * _EXCEEDED[len(of)] if gate > 0 else np.inf
+    passed = squared <= limit
+    likelihood -= 0.5 * (np.minimum(squared, limit) + np.linalg.slogdet(s)[1])
+    gain = np.swapaxes(weighted[..., 1:], 1, 2) * passed[:, None, None]
+    left = np.eye(m) - gain @ h
+    p = left @ p @ np.swapaxes(left, 1, 2) + gain @ r @ np.swapaxes(gain, 1, 2)
+    return x + np.einsum("bij,bj->bi", gain, new), p
+
+
+def _observation(of: Sequence[int], m: int) -> Floats:
+    h = np.zeros((len(of), m))
+    h[range(len(of)), of] = 1
+    h[:, 7] += h[:, 5]
+    h[:, 8] += h[:, 6]
+    return h
+
+
+def _backward(events: Sequence[Event], made: _Forward) -> Smoothed:
+    """Of a filter's only variant."""
+    x, p = made.x[:, 0].copy(), made.p[:, 0].copy()
+    m, since = x.shape[1], np.eye(x.shape[1])
+    ends = np.array([i for i, one in enumerate(events) if one.period >= 0])
+    cross: list[Floats] = []
+    end = ends[-1]
+    for i in range(len(events) - 2, -1, -1):
+        ahead = made.p_ahead[i + 1, 0]
+        scale = np.sqrt(np.diag(ahead))
+        scale[scale == 0] = 1
+        scaled = ahead / np.outer(scale, scale) + 1e-13 * np.eye(m)
+        back = made.p[i, 0] @ made.f[i + 1, 0].T / scale
+        gain = np.linalg.solve(scaled, back.T).T / scale
+        x[i] += gain @ (x[i + 1] - made.ahead[i + 1, 0])
+        p[i] += gain @ (p[i + 1] - ahead) @ gain.T
+        p[i] = (p[i] + p[i].T) / 2
+        since = gain @ since
+        if events[i].period >= 0:
+            if i < ends[-1]:
+                cross.append(p[end] @ since.T)
+            end, since = i, np.eye(m)
+    rows = np.array([events[i].period for i in ends])
+    mixed = np.array(cross[::-1]).reshape(len(ends) - 1, m, m)[:, :_NB, :_NB]
+    likelihood = float(made.likelihood[0])
+    return Smoothed(rows, x[ends, :_NB], p[ends, :_NB, :_NB], mixed, likelihood, x)
+
+
+# The two models ----------------------------------------------------------------------------------
+
+
+def smooth(
+    drive: Drive, car: CarParameters, discretisation: Discretisation, weights: GpWeights | None
+) -> Smoothed | None:
+    """The states of a drive, by the corrected model or, without weights, by a random walk; None
+    where too little was read."""
+    events = drive.events
+    if not events or all(one.period < 0 for one in events):
+        return None
+    if weights is None:
+        return _walked(events, drive, car)
+    path = _walked(events, drive, car).path if drive.path is None else drive.path
+    for _ in range(_LINEARISED):
+        model = _corrected(events, path[:, :_NB], car, discretisation, weights)
+        x0, p0 = _start(events[0], drive, car, path[0, :_NB])
+        made = _forward(events, x0[None], p0[None], model, car.tuning.estimator.gate)
+        found = _backward(events, made)
+        path = found.path
+    return found
+
+
+def _start(first: Event, drive: Drive, car: CarParameters, around: Floats) -> tuple[Floats, Floats]:
+    """Mean and covariance after the first pose."""
+    (deviation, _, _), x = car.tuning.estimator.settings(nominal=True), around.copy()
+    p = np.diag(np.square(deviation))
+    p[3:6] *= _VAGUE**2
+    x[6] = drive.steering_rad
+    read = {name for one in drive.readings for name in one.values}
+    for offset, name in ((7, "omega"), (8, "delta")):
+        x[offset], p[offset, offset] = 0.0, p[offset, offset] * (name in read)
+    p[6, 6] *= "delta" in read
+    if (pose := first.measured) is not None:
+        x[:3], p[:3, :3] = pose.value[:3], np.diag(pose.variance[:3])
+    return x, p
+
+
+def _columns(events: Sequence[Event]) -> tuple[Floats, Floats]:
+    """Inputs (2, e) and durations (1, e)."""
+    return np.array([one.u for one in events]).T, np.array([[one.duration_s for one in events]])
+
+
+def _stacked(matrix: Any, count: int) -> Floats:
+    """(n, m * count) of CasADi to (count, n, m)."""
+    array = np.asarray(matrix, dtype=np.float64)
+    return array.reshape(len(array), count, -1).transpose(1, 0, 2)
+
+
+def _corrected(
+    events: Sequence[Event],
+    path: Floats,
+    car: CarParameters,
+    discretisation: Discretisation,
+    weights: GpWeights,
+) -> _Transition:
+    """The corrected model, linearised along the path."""
+    before, (u, h), e = path[:-1], _columns(events[1:]), len(events) - 1
+    step = corrected_step(car, discretisation, weights)
+    ahead, slope, by_error = step(before[:, :_NX].T, u, h)
+    sigma = predictive_sigma(weights, np.column_stack([before[:, 3:_NX], u.T]))
+    spread = _stacked(by_error, e) * sigma[:, None] * np.sqrt(h.T / discretisation.step_s)[:, None]
+    f, q = np.tile(np.eye(_NB), (e, 1, 1)), np.zeros((e, _NB, _NB))
+    f[:, :_NX, :_NX] = _stacked(slope, e)
+    q[:, :_NX, :_NX] = spread @ spread.transpose(0, 2, 1)
+    drift = np.square(car.tuning.estimator.settings(nominal=False)[1])
+    q += np.diag(drift) * h.T[..., None]
+    after = before.copy()
+    after[:, :_NX] = np.asarray(ahead).T
+
+    def go(i: int, x: Floats) -> tuple[Floats, Floats, Floats]:
+        return after[i - 1] + (x - before[i - 1]) @ f[i - 1].T, f[i - 1], q[i - 1]
+
+    return go
+
+
+def corrected_step(
+    car: CarParameters, discretisation: Discretisation, weights: GpWeights | None
+) -> ca.Function:
+    """(x, u, h) -> x_next, its derivatives by x (7, 7), and by the error of a step (7, 3)."""
+    x, u, h, e = (ca.MX.sym(*one) for one in (("x", 7), ("u", 2), ("h", 1), ("e", 3)))
+    share = h / discretisation.step_s
+    mean = 0 if weights is None else share * mean_function(weights)(ca.vertcat(x[3:7], u))
+    ahead = discretisation.over(NOMINAL(car))(x, u, mean + e, h)
+    found = [ahead, ca.jacobian(ahead, x), ca.jacobian(ahead, e)]
+    at = ca.Function("at", [x, u, h, e], [ca.densify(one) for one in found])
+    return ca.Function("step", [x, u, h], list(at(x, u, h, ca.DM.zeros(3))))
+
+
+def _walk() -> ca.Function:
+    """(x, u, h) -> x_next and its derivatives; x (12,) ends with the accelerations."""
+    x, u, h = ca.SX.sym("x", _NB + 3), ca.SX.sym("u", 2), ca.SX.sym("h")
+    velocities = x[3:6] + h * x[_NB:]
+    pose = pose_from_velocities(x, velocities, h)
+    ahead = ca.vertcat(pose, velocities, x[6] + h * u[1], x[7:])
+    return ca.Function("walk", [x, u, h], [ahead, ca.densify(ca.jacobian(ahead, x))])
+
+
+def _jerk(h: Floats, psi: Floats) -> Floats:
+    """Covariances (3, e, 12, 12) that white jerk of density 1 along the car, across it and about
+    it adds within h (e,)."""
+    part = np.array([[h**5 / 20, h**4 / 8, h**3 / 6], [h**4 / 8, h**3 / 3, h**2 / 2],
+                     [h**3 / 6, h**2 / 2, h]]).transpose(2, 0, 1)  # fmt: skip
+    c, s, one, none = np.cos(psi), np.sin(psi), np.ones_like(h), np.zeros_like(h)
+    q = np.zeros((3, len(h), _NB + 3, _NB + 3))
+    for axis, direction in enumerate(((c, s, none), (-s, c, none), (none, none, one))):
+        turn = np.zeros((len(h), _NB + 3, 3))
+        turn[:, :3, 0] = np.column_stack(direction)
+        turn[:, 3 + axis, 1] = turn[:, _NB + axis, 2] = 1
+        q[axis] = turn @ part @ turn.transpose(0, 2, 1)
+    return q
+
+
+def _walked(events: Sequence[Event], drive: Drive, car: CarParameters) -> Smoothed:
+    """By the random walk of the velocities, with the noise that makes the readings most likely."""
+    walk, (u, h) = _walk(), _columns(events)
+    x0, p0 = np.zeros(_NB + 3), np.zeros((_NB + 3, _NB + 3))
+    x0[:_NB], p0[:_NB, :_NB] = _start(events[0], drive, car, np.zeros(_NB))
+    full = car.friction * GRAVITY_MPS2 * np.array([1, 1, 1 / car.wheelbase_m])
+    p0[_NB:, _NB:] = np.diag(full**2)
+    gate, middle = car.tuning.estimator.gate, full**2 / _JERK_S
+
+    def stepwise(i: int, x: Floats) -> tuple[Floats, Floats, Floats]:
+        ahead, f = walk(x[0], u[:, i], h[0, i])
+        q = _jerk(h[0, i : i + 1], x[:, 2])[:, 0]
+        return np.asarray(ahead).T, np.asarray(f), np.tensordot(middle, q, 1)
+
+    path = _backward(events, _forward(events, x0[None], p0[None], stepwise, gate)).path
+    some = events[:_SEARCHED]
+    density = middle[None]
+    for factor, count in ((10.0, 5), (3.0, 3), (1.7, 3)):
+        steps = factor ** np.arange(-(count // 2), count // 2 + 1)
+        grid = np.array(list(product(steps, repeat=3 if count == 3 else 2)))
+        grid = grid if count == 3 else grid[:, [0, 0, 1]]
+        tried = density * grid
+        go = _along(path, walk, u, h, tried)
+        starts = np.tile(x0, (len(tried), 1)), np.tile(p0, (len(tried), 1, 1))
+        found = _forward(some, *starts, go, gate).likelihood
+        density = tried[[int(np.argmax(found))]]
+    made = _forward(events, x0[None], p0[None], _along(path, walk, u, h, density), gate)
+    return _backward(events, made)
+
+
+def _along(path: Floats, walk: ca.Function, u: Floats, h: Floats, density: Floats) -> _Transition:
+    """The random walk linearised along the path (e, 12), for densities (b, 3) of the jerk."""
+    before, e = path[:-1], len(path) - 1
+    ahead, slope = walk(before.T, u[:, 1:], h[:, 1:])
+    after, f = np.asarray(ahead).T, _stacked(slope, e)
+    q = _jerk(h[0, 1:], before[:, 2])
+
+    def go(i: int, x: Floats) -> tuple[Floats, Floats, Floats]:
+        added = np.tensordot(density, q[:, i - 1], 1)
+        return after[i - 1] + (x - before[i - 1]) @ f[i - 1].T, f[i - 1], added
+
+    return go
+
+
+# Samples -----------------------------------------------------------------------------------------
+
+
+def smoothed_states(
+    states: Columns, cycles: Columns, car: CarParameters, step_s: float
+) -> tuple[Columns, Estimates | None]:
+    """``states`` with ``x`` smoothed by the random walk where they are estimated, and how well they
+    are known, row by row; those that nothing can be made of are left out.
+
+    Columns as of :func:`bayesrace.learning.sources.dataset_from_columns`.
+    """
+    names = states.dtype.names or ()
+    if "readings" not in names or not states["estimated"].any():
+        return with_estimates(states, cycles), None
+    discretisation = PREDICTION.model_copy(update={"step_s": step_s})
+    known, filled = ~states["estimated"], states.copy()
+    exact = Estimates.exact(len(states))
+    drives: list[Drive] = []
+    for rows in _unbroken(states, step_s):
+        drive = _drive(states[rows], cycles)
+        found = smooth(drive, car, discretisation, None)
+        if found is None:
+            continue
+        own = rows[found.rows]
+        filled["x"][own], known[own] = found.x[:, :_NX], True
+        exact.deviation[own] = _deviation(found, drive, car, discretisation, None)
+        exact.origin[own, 0], exact.origin[own, 1] = len(drives), found.rows
+        drives.append(replace(drive, path=found.path))
+    kept = np.flatnonzero(known)
+    return filled[kept], Estimates(exact.deviation, exact.origin, tuple(drives)).select(kept)
+
+
+def smoothed_again(
+    dataset: Dataset, discretisation: Discretisation, weights: GpWeights
+) -> tuple[Dataset, float]:
+    """The same samples, those whose drives are at hand smoothed by the corrected model; and the
+    mean log likelihood of what was read in these."""
+    estimates = dataset.estimates
+    if estimates is None or not estimates.drives:
+        return dataset, 0.0
+    x, x_next, deviation = dataset.x.copy(), dataset.x_next.copy(), estimates.deviation.copy()
+    likelihood, count = 0.0, 0
+    for number, drive in enumerate(estimates.drives):
+        found = smooth(drive, dataset.car, discretisation, weights)
+        own = np.flatnonzero(estimates.origin[:, 0] == number)
+        if found is None:
+            continue
+        place = np.searchsorted(found.rows, estimates.origin[own, 1])
+        x[own], x_next[own] = found.x[place, :_NX], found.x[place + 1, :_NX]
+        spread = _deviation(found, drive, dataset.car, discretisation, weights)
+        deviation[own] = spread[place]
+        likelihood, count = likelihood + found.log_likelihood, count + len(drive.readings)
+    again = replace(estimates, deviation=deviation)
+    return replace(dataset, x=x, x_next=x_next, estimates=again), likelihood / max(count, 1)
+
+
+def _unbroken(states: Columns, step_s: float) -> list[Rows]:
+    """Rows of each estimated drive in which no state is missing."""
+    joined = (states["run"][1:] == states["run"][:-1]) & (np.diff(states["seq"]) == 1)
+    joined &= np.abs(np.diff(states["time_s"]) - step_s) <= ROUNDING
+    joined &= states["estimated"][1:] == states["estimated"][:-1]
+    parts = np.split(np.arange(len(states)), np.flatnonzero(~joined) + 1)
+    return [part for part in parts if states["estimated"][part[0]]]
+
+
+def _drive(states: Columns, cycles: Columns) -> Drive:
+    first = states[0]
+    own = cycles[(cycles["run"] == first["run"]) & (cycles["state_seq"] == first["seq"])]
+    believed: tuple[float, ...] = (own["estimate"][0] if len(own) else ()) or ()
+    readings = tuple(one for several in states["readings"] for one in several)
+    steering_rad = believed[6] if believed else 0.0
+    return Drive(states["time_s"].copy(), states["u_applied"].copy(), readings, steering_rad)
+
+
+def _deviation(
+    found: Smoothed,
+    drive: Drive,
+    car: CarParameters,
+    discretisation: Discretisation,
+    weights: GpWeights | None,
+) -> Floats:
+    """Standard deviations (m, 4) of the steps from the smoothed states on, and of the angles; of
+    the last state's step there is none."""
+    x, u = found.x[:-1, :_NX], drive.u[found.rows[1:]]
+    h = np.full((1, len(x)), discretisation.step_s)
+    _, slope, _ = corrected_step(car, discretisation, weights)(x.T, u.T, h)
+    spread = np.zeros((len(found.x), 4))
+    spread[:-1, :3] = np.sqrt(found.step_variance(_stacked(slope, len(x))))
+    spread[:, 3] = np.sqrt(found.covariance[:, 6, 6])
+    return spread
