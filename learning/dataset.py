@@ -112,8 +112,7 @@ class Dataset:
         """The same samples without their drives: they stay as they are smoothed."""
         if self.estimates is None:
             return self
-        settled = Estimates.exact(len(self))
-        return replace(self, estimates=replace(settled, deviation=self.deviation))
+        return replace(self, estimates=Estimates.settled(self.deviation))
 
     def digest(self) -> str:
         """sha256 over car, step and samples."""

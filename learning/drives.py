@@ -114,9 +114,14 @@ class Estimates:
     drives: tuple[Drive, ...] = ()
 
     @classmethod
+    def settled(cls, deviation: Floats) -> "Estimates":
+        """Without drives."""
+        return cls(deviation, np.full((len(deviation), 2), -1))
+
+    @classmethod
     def exact(cls, count: int) -> "Estimates":
         """Of measured states."""
-        return cls(np.zeros((count, 4)), np.full((count, 2), -1))
+        return cls.settled(np.zeros((count, 4)))
 
     def select(self, rows: slice | Rows) -> "Estimates":
         """Those of the given rows, with the drives that they are of."""

@@ -21,7 +21,7 @@ Steering that no instrument reads is what was commanded, from what is known of i
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import product
 from typing import Any, Final
 
@@ -30,17 +30,15 @@ import numpy as np
 from scipy.stats import chi2
 
 from bayesrace.arrays import Floats, Rows
-from bayesrace.columns import Columns, with_estimates
 from bayesrace.gp.expression import mean_function
 from bayesrace.gp.weights import GpWeights
-from bayesrace.integrators import PREDICTION, Discretisation, pose_from_velocities
-from bayesrace.learning.dataset import ROUNDING, Dataset
-from bayesrace.learning.drives import Drive, Estimates, Event, Measured
+from bayesrace.integrators import Discretisation, pose_from_velocities
+from bayesrace.learning.drives import Drive, Event, Measured
 from bayesrace.learning.validation import NOMINAL, predictive_sigma
 from bayesrace.vehicles.parameters import CarParameters
 from bayesrace.vehicles.parts import GRAVITY_MPS2
 
-__all__ = ["Smoothed", "smooth", "smoothed_again", "smoothed_states"]
+__all__ = ["Smoothed", "corrected_step", "smooth", "stacked"]
 
 _NX: Final = 7
 _NB: Final = 9
@@ -227,7 +225,7 @@ def _columns(events: Sequence[Event]) -> tuple[Floats, Floats]:
     return np.array([one.u for one in events]).T, np.array([[one.duration_s for one in events]])
 
 
-def _stacked(matrix: Any, count: int) -> Floats:
+def stacked(matrix: Any, count: int) -> Floats:
     """(n, m * count) of CasADi to (count, n, m)."""
     array = np.asarray(matrix, dtype=np.float64)
     return array.reshape(len(array), count, -1).transpose(1, 0, 2)
@@ -245,9 +243,9 @@ def _corrected(
     step = corrected_step(car, discretisation, weights)
     ahead, slope, by_error = step(before[:, :_NX].T, u, h)
     sigma = predictive_sigma(weights, np.column_stack([before[:, 3:_NX], u.T]))
-    spread = _stacked(by_error, e) * sigma[:, None] * np.sqrt(h.T / discretisation.step_s)[:, None]
+    spread = stacked(by_error, e) * sigma[:, None] * np.sqrt(h.T / discretisation.step_s)[:, None]
     f, q = np.tile(np.eye(_NB), (e, 1, 1)), np.zeros((e, _NB, _NB))
-    f[:, :_NX, :_NX] = _stacked(slope, e)
+    f[:, :_NX, :_NX] = stacked(slope, e)
     q[:, :_NX, :_NX] = spread @ spread.transpose(0, 2, 1)
     drift = np.square(car.tuning.estimator.settings(nominal=False)[1])
     q += np.diag(drift) * h.T[..., None]
@@ -331,7 +329,7 @@ def _along(path: Floats, walk: ca.Function, u: Floats, h: Floats, density: Float
     """The random walk linearised along the path (e, 12), for densities (b, 3) of the jerk."""
     before, e = path[:-1], len(path) - 1
     ahead, slope = walk(before.T, u[:, 1:], h[:, 1:])
-    after, f = np.asarray(ahead).T, _stacked(slope, e)
+    after, f = np.asarray(ahead).T, stacked(slope, e)
     q = _jerk(h[0, 1:], before[:, 2])
 
     def go(i: int, x: Floats) -> tuple[Floats, Floats, Floats]:
@@ -339,95 +337,3 @@ def _along(path: Floats, walk: ca.Function, u: Floats, h: Floats, density: Float
         return after[i - 1] + (x - before[i - 1]) @ f[i - 1].T, f[i - 1], added
 
     return go
-
-
-# Samples -----------------------------------------------------------------------------------------
-
-
-def smoothed_states(
-    states: Columns, cycles: Columns, car: CarParameters, step_s: float
-) -> tuple[Columns, Estimates | None]:
-    """``states`` with ``x`` smoothed by the random walk where they are estimated, and how well they
-    are known, row by row; those that nothing can be made of are left out.
-
-    Columns as of :func:`bayesrace.learning.sources.dataset_from_columns`.
-    """
-    names = states.dtype.names or ()
-    if "readings" not in names or not states["estimated"].any():
-        return with_estimates(states, cycles), None
-    discretisation = PREDICTION.model_copy(update={"step_s": step_s})
-    known, filled = ~states["estimated"], states.copy()
-    exact = Estimates.exact(len(states))
-    drives: list[Drive] = []
-    for rows in _unbroken(states, step_s):
-        drive = _drive(states[rows], cycles)
-        found = smooth(drive, car, discretisation, None)
-        if found is None:
-            continue
-        own = rows[found.rows]
-        filled["x"][own], known[own] = found.x[:, :_NX], True
-        exact.deviation[own] = _deviation(found, drive, car, discretisation, None)
-        exact.origin[own, 0], exact.origin[own, 1] = len(drives), found.rows
-        drives.append(replace(drive, path=found.path))
-    kept = np.flatnonzero(known)
-    return filled[kept], Estimates(exact.deviation, exact.origin, tuple(drives)).select(kept)
-
-
-def smoothed_again(
-    dataset: Dataset, discretisation: Discretisation, weights: GpWeights
-) -> tuple[Dataset, float]:
-    """The same samples, those whose drives are at hand smoothed by the corrected model; and the
-    mean log likelihood of what was read in these."""
-    estimates = dataset.estimates
-    if estimates is None or not estimates.drives:
-        return dataset, 0.0
-    x, x_next, deviation = dataset.x.copy(), dataset.x_next.copy(), estimates.deviation.copy()
-    likelihood, count = 0.0, 0
-    for number, drive in enumerate(estimates.drives):
-        found = smooth(drive, dataset.car, discretisation, weights)
-        own = np.flatnonzero(estimates.origin[:, 0] == number)
-        if found is None:
-            continue
-        place = np.searchsorted(found.rows, estimates.origin[own, 1])
-        x[own], x_next[own] = found.x[place, :_NX], found.x[place + 1, :_NX]
-        spread = _deviation(found, drive, dataset.car, discretisation, weights)
-        deviation[own] = spread[place]
-        likelihood, count = likelihood + found.log_likelihood, count + len(drive.readings)
-    again = replace(estimates, deviation=deviation)
-    return replace(dataset, x=x, x_next=x_next, estimates=again), likelihood / max(count, 1)
-
-
-def _unbroken(states: Columns, step_s: float) -> list[Rows]:
-    """Rows of each estimated drive in which no state is missing."""
-    joined = (states["run"][1:] == states["run"][:-1]) & (np.diff(states["seq"]) == 1)
-    joined &= np.abs(np.diff(states["time_s"]) - step_s) <= ROUNDING
-    joined &= states["estimated"][1:] == states["estimated"][:-1]
-    parts = np.split(np.arange(len(states)), np.flatnonzero(~joined) + 1)
-    return [part for part in parts if states["estimated"][part[0]]]
-
-
-def _drive(states: Columns, cycles: Columns) -> Drive:
-    first = states[0]
-    own = cycles[(cycles["run"] == first["run"]) & (cycles["state_seq"] == first["seq"])]
-    believed: tuple[float, ...] = (own["estimate"][0] if len(own) else ()) or ()
-    readings = tuple(one for several in states["readings"] for one in several)
-    steering_rad = believed[6] if believed else 0.0
-    return Drive(states["time_s"].copy(), states["u_applied"].copy(), readings, steering_rad)
-
-
-def _deviation(
-    found: Smoothed,
-    drive: Drive,
-    car: CarParameters,
-    discretisation: Discretisation,
-    weights: GpWeights | None,
-) -> Floats:
-    """Standard deviations (m, 4) of the steps from the smoothed states on, and of the angles; of
-    the last state's step there is none."""
-    x, u = found.x[:-1, :_NX], drive.u[found.rows[1:]]
-    h = np.full((1, len(x)), discretisation.step_s)
-    _, slope, _ = corrected_step(car, discretisation, weights)(x.T, u.T, h)
-    spread = np.zeros((len(found.x), 4))
-    spread[:-1, :3] = np.sqrt(found.step_variance(_stacked(slope, len(x))))
-    spread[:, 3] = np.sqrt(found.covariance[:, 6, 6])
-    return spread

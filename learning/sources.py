@@ -42,26 +42,18 @@ from bayesrace.learning.dataset import (
     concatenate,
     dataset_from_arrays,
     filter_dataset,
-)
+)  # fmt: skip
 from bayesrace.learning.drives import Estimates
-from bayesrace.learning.smoothing import smoothed_states
+from bayesrace.learning.estimates import smoothed_states
 from bayesrace.log import LogReader
 from bayesrace.messages import STATE, TELEMETRY, TRUTH, topic_of
 from bayesrace.vehicles import CarParameters, builtin_cars, car_text, described_car
 
-__all__ = [
-    "CYCLES",
-    "MAX_BYTES",
-    "STATES",
-    "TRUE_STATES",
-    "LogFacts",
-    "Samples",
-    "dataset_from_columns",
-]
-__all__ += ["dataset_from_log", "dataset_from_npz", "log_facts", "read_samples", "write_npz"]
+__all__ = ["CYCLES", "MAX_BYTES", "STATES", "TRUE_STATES", "LogFacts", "Samples"]
+__all__ += ["dataset_from_columns", "dataset_from_log", "dataset_from_npz", "log_facts"]
+__all__ += ["read_samples", "write_npz"]
 
 T = TypeVar("T")
-
 TRUE_STATES: Final = "seq run time_s x u_applied"
 """Columns of the true states that samples can be made of, ..."""
 STATES: Final = f"{TRUE_STATES} estimated readings"
@@ -294,8 +286,7 @@ class _File:
             return dataset_from_arrays(self.car, float(step_s), *self._numbers(*_DRIVE))
         known = None
         if "deviation" in names:
-            (deviation,) = self._numbers("deviation")
-            known = replace(Estimates.exact(len(deviation)), deviation=deviation)
+            known = Estimates.settled(*self._numbers("deviation"))
         return Dataset(self.car, float(step_s), *self._numbers(*_SAMPLES), estimates=known)
 
     def _is_published(self) -> bool:

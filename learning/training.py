@@ -24,7 +24,6 @@ else.
 """
 
 import hashlib
-import math
 import multiprocessing
 import os
 import signal
@@ -52,38 +51,24 @@ from bayesrace.gp.weights import (
     GpWeights,
     encode_weights,
     read_weights,
-)
+)  # fmt: skip
 from bayesrace.integrators import Discretisation
 from bayesrace.learning.dataset import Dataset, concatenate, left_out
-from bayesrace.learning.gaussian_process import (
-    Fit,
-    PairDistances,
-    maximise,
-    refine,
-    starts,
-)
+from bayesrace.learning.estimates import smoothed_in_turns
+from bayesrace.learning.gaussian_process import Fit, PairDistances, maximise, refine, starts
 from bayesrace.learning.settings import MIN_SAMPLES, Progress, TrainingSettings
-from bayesrace.learning.smoothing import smoothed_again
 from bayesrace.learning.subset import bounded, evenly, most_informative, spans, stretches
 from bayesrace.learning.target import KernelScore, Target
 from bayesrace.learning.validation import identity, residual
 from bayesrace.processes import die_with_parent
 
 __all__ = ["MAX_SAMPLES", "NICE", "Outcome", "Trainer", "Training", "fit", "perform", "train"]
-
 MAX_SAMPLES: Final = 100_000
 """Choosing among more would take gigabytes."""
-
 _CONSTANT: Final = 1e-9
 """A column whose standard deviation is below this share of its size never changes."""
-
 _THINNED: Final = 3
 """One in so many samples shows where the optimum is."""
-
-_ROUNDS: Final = 4
-_GAIN: Final = 1e-3
-"""Of the mean log likelihood of a reading, for which drives are smoothed once more."""
-
 _CHECKED: Final = 200
 """Samples that go with the weights, for a controller to check them by."""
 
@@ -131,33 +116,12 @@ def fit(
             f"GP training: cannot start from weights for {initial.discretisation}, this is {model}"
         )
     if dataset.estimates is not None and dataset.estimates.drives:
-        dataset = _smoothed(dataset, discretisation, settings, initial, report)
+
+        def learn(samples: Dataset, before: GpWeights | None) -> GpWeights:
+            return _fit(samples, discretisation, settings, before, 1.0, report).weights
+
+        dataset = smoothed_in_turns(dataset, discretisation, initial, learn)
     return _fit(dataset, discretisation, settings, initial, widen, report)
-
-
-def _smoothed(
-    dataset: Dataset,
-    discretisation: Discretisation,
-    settings: TrainingSettings,
-    weights: GpWeights | None,
-    report: Progress,
-) -> Dataset:
-    """The samples smoothed and learned from in turn, as long as that makes it more likely what was
-    read in the drives; ``weights``: that drove, to begin with.
-
-    Smoothing takes the model's errors for noise of each step. So variances are not widened here,
-    and what smoothing leaves unknown counts as noise (:func:`_learned`): else the model would
-    confirm itself, surer each time.
-    """
-    score = -math.inf
-    for _ in range(_ROUNDS):
-        if weights is None or score > -math.inf:
-            weights = _fit(dataset, discretisation, settings, weights, 1.0, report).weights
-        again, found = smoothed_again(dataset, discretisation, weights)
-        if found <= score + _GAIN:
-            break
-        dataset, score = again, found
-    return dataset
 
 
 def _fit(
@@ -174,10 +138,11 @@ def _fit(
     samples = dataset.with_mirror_images() if dataset.car.mirrored_samples else dataset
     images = len(samples) // len(dataset)
     folds = np.repeat(stretches(dataset, settings.folds), images)
-    columns = zip(
-        OUTPUTS, residual(samples, discretisation).T, samples.deviation.T[:3], strict=True
-    )
-    targets = [Target.of(name, samples.features, y, folds, spread) for name, y, spread in columns]
+    columns = residual(samples, discretisation).T, samples.deviation.T[:3]
+    targets = [
+        Target.of(name, samples.features, y, folds, spread)
+        for name, y, spread in zip(OUTPUTS, *columns, strict=True)
+    ]
     rows = evenly(len(samples), settings.hyper_points)
     if images == 2 and len(samples) >= 2 * len(rows):
         rows = rows - rows % 2 + np.arange(len(rows)) % 2  # a sample and an image in turn
@@ -255,11 +220,11 @@ def _optimise(
 
     def best(target: Target, kind: str, guesses: Sequence[Floats]) -> Fit:
         rough: list[Fit] = []
+        y, known = target.y[some], target.known[some]
         for guess in guesses:
             if ended.is_set():
                 raise InterruptedError
-            known = target.known[some]
-            rough.append(maximise(kind, few, target.y[some], guess, *limits, known=known))
+            rough.append(maximise(kind, few, y, guess, *limits, known=known))
         found = max(rough, key=lambda fit: fit.log_likelihood)
         return refine(pairs, target.y, found, *limits, known=target.known)
 
@@ -296,7 +261,7 @@ def _learned(
         kernel=fit.kind,
         length_scales=covariance.lengths * target.z_scale,
         signal_variance=covariance.signal * scale,
-        noise_variance=(covariance.noise + float(target.known.mean())) * scale,
+        noise_variance=(covariance.noise + float(np.median(target.known))) * scale,
         inputs=inputs,
         alpha=target.posterior(rows, covariance).alpha / scale,
         y_mean=target.y_mean,

@@ -1,0 +1,144 @@
+"""Samples of states that are estimated: smoothed by a random walk as they are read, and by the
+learned model as they are learned from."""
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+
+from bayesrace.arrays import Floats, Rows
+from bayesrace.columns import Columns, with_estimates
+from bayesrace.gp.weights import GpWeights
+from bayesrace.integrators import PREDICTION, Discretisation
+from bayesrace.learning.dataset import ROUNDING, Dataset
+from bayesrace.learning.drives import Drive, Estimates
+from bayesrace.learning.smoothing import Smoothed, corrected_step, smooth, stacked
+from bayesrace.vehicles.parameters import CarParameters
+
+__all__ = ["smoothed_again", "smoothed_in_turns", "smoothed_states"]
+
+_NX: Final = 7
+_ROUNDS: Final = 4
+_NOISE: Final = 0.4
+"""Of the noise that weights state, what smoothing takes for their model's. The rest is what the
+smoothing before left unknown, which it would only confirm: with all of it, noise falls by a tenth
+each round."""
+
+
+def smoothed_states(
+    states: Columns, cycles: Columns, car: CarParameters, step_s: float
+) -> tuple[Columns, Estimates | None]:
+    """``states`` with ``x`` smoothed by the random walk where they are estimated, and how well they
+    are known, row by row; those that nothing can be made of are left out.
+
+    Columns as of :func:`bayesrace.learning.sources.dataset_from_columns`.
+    """
+    names = states.dtype.names or ()
+    if "readings" not in names or not states["estimated"].any():
+        return with_estimates(states, cycles), None
+    discretisation = PREDICTION.model_copy(update={"step_s": step_s})
+    known, filled = ~states["estimated"], states.copy()
+    exact = Estimates.exact(len(states))
+    drives: list[Drive] = []
+    for rows in _unbroken(states, step_s):
+        drive = _drive(states[rows], cycles)
+        found = smooth(drive, car, discretisation, None)
+        if found is None:
+            continue
+        own = rows[found.rows]
+        filled["x"][own], known[own] = found.x[:, :_NX], True
+        exact.deviation[own] = _deviation(found, drive, car, discretisation, None)
+        exact.origin[own, 0], exact.origin[own, 1] = len(drives), found.rows
+        drives.append(replace(drive, path=found.path))
+    kept = np.flatnonzero(known)
+    return filled[kept], Estimates(exact.deviation, exact.origin, tuple(drives)).select(kept)
+
+
+def smoothed_again(
+    dataset: Dataset, discretisation: Discretisation, weights: GpWeights
+) -> tuple[Dataset, float]:
+    """The same samples, those whose drives are at hand smoothed by the corrected model; and the
+    mean log likelihood of what was read in these."""
+    estimates = dataset.estimates
+    if estimates is None or not estimates.drives:
+        return dataset, 0.0
+    x, x_next, deviation = dataset.x.copy(), dataset.x_next.copy(), estimates.deviation.copy()
+    likelihood, count = 0.0, 0
+    for number, drive in enumerate(estimates.drives):
+        found = smooth(drive, dataset.car, discretisation, weights)
+        own = np.flatnonzero(estimates.origin[:, 0] == number)
+        if found is None:
+            continue
+        place = np.searchsorted(found.rows, estimates.origin[own, 1])
+        x[own], x_next[own] = found.x[place, :_NX], found.x[place + 1, :_NX]
+        spread = _deviation(found, drive, dataset.car, discretisation, weights)
+        deviation[own] = spread[place]
+        likelihood, count = likelihood + found.log_likelihood, count + len(drive.readings)
+    again = replace(estimates, deviation=deviation)
+    return replace(dataset, x=x, x_next=x_next, estimates=again), likelihood / max(count, 1)
+
+
+def smoothed_in_turns(
+    dataset: Dataset,
+    discretisation: Discretisation,
+    weights: GpWeights | None,
+    learn: Callable[[Dataset, GpWeights | None], GpWeights],
+) -> Dataset:
+    """The samples smoothed and learned from in turn: those of the round whose weights make it most
+    likely what was read in the drives. ``weights``: that drove, to begin with; ``learn``: new ones
+    from samples, beginning with others.
+
+    Variances are not to be widened by ``learn``, and what smoothing leaves unknown is to count as
+    noise: else the model would confirm itself, surer each time.
+    """
+    best, score = dataset, -math.inf
+    for number in range(_ROUNDS):
+        if weights is None or number:
+            weights = _surer(learn(dataset, weights))
+        dataset, found = smoothed_again(dataset, discretisation, weights)
+        if found > score:
+            best, score = dataset, found
+    return best
+
+
+def _surer(weights: GpWeights) -> GpWeights:
+    a, b, c = (replace(one, noise_variance=_NOISE * one.noise_variance) for one in weights.outputs)
+    return replace(weights, outputs=(a, b, c))
+
+
+def _unbroken(states: Columns, step_s: float) -> list[Rows]:
+    """Rows of each estimated drive in which no state is missing."""
+    joined = (states["run"][1:] == states["run"][:-1]) & (np.diff(states["seq"]) == 1)
+    joined &= np.abs(np.diff(states["time_s"]) - step_s) <= ROUNDING
+    joined &= states["estimated"][1:] == states["estimated"][:-1]
+    parts = np.split(np.arange(len(states)), np.flatnonzero(~joined) + 1)
+    return [part for part in parts if states["estimated"][part[0]]]
+
+
+def _drive(states: Columns, cycles: Columns) -> Drive:
+    first = states[0]
+    own = cycles[(cycles["run"] == first["run"]) & (cycles["state_seq"] == first["seq"])]
+    believed: tuple[float, ...] = (own["estimate"][0] if len(own) else ()) or ()
+    readings = tuple(one for several in states["readings"] for one in several)
+    steering_rad = believed[6] if believed else 0.0
+    return Drive(states["time_s"].copy(), states["u_applied"].copy(), readings, steering_rad)
+
+
+def _deviation(
+    found: Smoothed,
+    drive: Drive,
+    car: CarParameters,
+    discretisation: Discretisation,
+    weights: GpWeights | None,
+) -> Floats:
+    """Standard deviations (m, 4) of the steps from the smoothed states on, and of the angles; of
+    the last state's step there is none."""
+    x, u = found.x[:-1, :_NX], drive.u[found.rows[1:]]
+    h = np.full((1, len(x)), discretisation.step_s)
+    _, slope, _ = corrected_step(car, discretisation, weights)(x.T, u.T, h)
+    spread = np.zeros((len(found.x), 4))
+    spread[:-1, :3] = np.sqrt(found.step_variance(stacked(slope, len(x))))
+    spread[:, 3] = np.sqrt(found.covariance[:, 6, 6])
+    return spread
