@@ -21,7 +21,7 @@ __all__ = ["smoothed_again", "smoothed_in_turns", "smoothed_states"]
 
 _NX: Final = 7
 _ROUNDS: Final = 4
-_NOISE: Final = 0.4
+_NOISE: Final = 0.65
 """Of the noise that weights state, what smoothing takes for their model's. The rest is what the
 smoothing before left unknown, which it would only confirm: with all of it, noise falls by a tenth
 each round."""
