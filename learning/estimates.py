@@ -67,10 +67,13 @@ def smoothed_again(
     x, x_next, deviation = dataset.x.copy(), dataset.x_next.copy(), estimates.deviation.copy()
     likelihood, count = 0.0, 0
     for number, drive in enumerate(estimates.drives):
-        found = smooth(drive, dataset.car, discretisation, weights)
+        try:
+            found = smooth(drive, dataset.car, discretisation, weights)
+        except np.linalg.LinAlgError:  # what is believed has run away
+            found = None
         own = np.flatnonzero(estimates.origin[:, 0] == number)
         if found is None:
-            continue
+            return dataset, -math.inf
         place = np.searchsorted(found.rows, estimates.origin[own, 1])
         x[own], x_next[own] = found.x[place, :_NX], found.x[place + 1, :_NX]
         spread = _deviation(found, drive, dataset.car, discretisation, weights)

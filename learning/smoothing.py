@@ -50,6 +50,8 @@ _SEARCHED: Final = 600
 """Events of a drive that the noise of the random walk is found by."""
 _EXCEEDED: Final = {n: float(chi2.ppf(0.999, n)) for n in range(1, _NX + 1)}
 """Squared distances that one of 1,000 right readings exceeds, as in the C code."""
+_REFUSED: Final = 5
+"""Readings in a row: then it is the filter that is wrong."""
 _LINEARISED: Final = 2
 """Passes along the result of the one before."""
 
@@ -106,7 +108,7 @@ def _forward(
     (b, m), e = x0.shape, len(events)
     means, covariances = np.zeros((2, e, b, m)), np.zeros((3, e, b, m, m))
     made = _Forward(means[0], covariances[0], means[1], covariances[1], covariances[2], np.zeros(b))
-    x, p = x0, p0
+    x, p, refused = x0, p0, np.zeros(b, dtype=np.int64)
     made.x[0], made.p[0] = x, p
     for i in range(1, e):
         event = events[i]
@@ -118,15 +120,16 @@ def _forward(
             made.f[i] = np.eye(m)
         made.ahead[i], made.p_ahead[i] = x, p
         if event.measured is not None:
-            x, p = _updated(x, p, event.measured, gate, made.likelihood)
+            x, p = _updated(x, p, event.measured, gate, made.likelihood, refused)
         made.x[i], made.p[i] = x, p
     return made
 
 
 def _updated(
-    x: Floats, p: Floats, measured: Measured, gate: float, likelihood: Floats
+    x: Floats, p: Floats, measured: Measured, gate: float, likelihood: Floats, refused: Rows
 ) -> tuple[Floats, Floats]:
-    """With a reading, where the gate lets it pass; adds to the likelihoods (b,)."""
+    """With a reading, where the gate lets it pass, or has refused too many in a row (``refused``,
+    (b,)); adds to the likelihoods (b,)."""
     of, m = measured.states, x.shape[1]
     h, r = _observation(of, m), np.diag(measured.variance)
     hp = h @ p
@@ -138,7 +141,8 @@ def _updated(
     weighted = np.linalg.solve(s, np.concatenate([new[..., None], hp], axis=2))
     squared = np.einsum("bi,bi->b", new, weighted[..., 0])
     limit = gate * _EXCEEDED[len(of)] if gate > 0 else np.inf
-    passed = squared <= limit
+    passed = (squared <= limit) | (refused >= _REFUSED)
+    refused[:] = np.where(squared <= limit, 0, refused + 1)
     likelihood -= 0.5 * (np.minimum(squared, limit) + np.linalg.slogdet(s)[1])
     gain = np.swapaxes(weighted[..., 1:], 1, 2) * passed[:, None, None]
     left = np.eye(m) - gain @ h
@@ -189,7 +193,7 @@ def smooth(
     drive: Drive, car: CarParameters, discretisation: Discretisation, weights: GpWeights | None
 ) -> Smoothed | None:
     """The states of a drive, by the corrected model or, without weights, by a random walk; None
-    where too little was read."""
+    where too little was read, or the model cannot follow."""
     events = drive.events
     if not events or all(one.period < 0 for one in events):
         return None
@@ -202,6 +206,8 @@ def smooth(
         made = _forward(events, x0[None], p0[None], model, car.tuning.estimator.gate)
         found = _backward(events, made)
         path = found.path
+        if not np.isfinite(path).all():
+            return None
     return found
 
 
