@@ -222,17 +222,17 @@ def _members(folder: Path) -> Members:
 def _check_signature(members: Members, folder: Path) -> None:
     # 19 MB, which a process without certificates does not need.
     from cryptography import x509
-    from cryptography.exceptions import InvalidSignature
+    from cryptography.exceptions import InvalidSignature, UnsupportedAlgorithm
     from cryptography.hazmat.primitives import hashes
     from cryptography.hazmat.primitives.asymmetric import ec
 
-    key = x509.load_pem_x509_certificate((folder / AUTHORITY).read_bytes()).public_key()
     try:
+        key = x509.load_pem_x509_certificate((folder / AUTHORITY).read_bytes()).public_key()
         if not isinstance(key, ec.EllipticCurvePublicKey):
             raise InvalidSignature
         signature = bytes.fromhex(members.signature)
         key.verify(signature, members.content(), ec.ECDSA(hashes.SHA256()))
-    except (InvalidSignature, ValueError):
+    except (InvalidSignature, ValueError, UnsupportedAlgorithm):
         raise InputError(
             f"{folder / MEMBERS} is not signed by the authority in {AUTHORITY}: copy it from where "
             "'bayesrace certs' wrote it; if that is from before lists were signed, 'bayesrace "
@@ -256,7 +256,7 @@ def calendar(time_s: float | None = None) -> str:
 def _verified(folder: Path) -> tuple[str, float, float]:
     """Name, begin and end of the certificate; InputError if it cannot be used."""
     from cryptography import x509  # as above
-    from cryptography.exceptions import InvalidSignature
+    from cryptography.exceptions import InvalidSignature, UnsupportedAlgorithm
     from cryptography.hazmat.primitives.serialization import load_pem_private_key
 
     try:
@@ -267,13 +267,13 @@ def _verified(folder: Path) -> tuple[str, float, float]:
         key = load_pem_private_key((folder / KEY).read_bytes(), None)
         if key.public_key() != one.public_key():
             raise ValueError("another key")
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, UnsupportedAlgorithm) as error:
         raise InputError(
             f"{folder}: certificate, key and authority do not fit ({error}): {_COPY}"
         ) from None
     try:
         one.verify_directly_issued_by(authority)
-    except (InvalidSignature, TypeError, ValueError):
+    except (InvalidSignature, TypeError, ValueError, UnsupportedAlgorithm):
         why = f"is not of the authority in {AUTHORITY}: {_COPY}"
         raise InputError(f"certificate in {folder} {why}") from None
     begins_s, ends_s = (

@@ -7,7 +7,7 @@ from typing import Final
 
 import numpy as np
 
-from bayesrace.columns import columns_of
+from bayesrace.columns import columns_of, with_estimates
 from bayesrace.errors import InputError
 from bayesrace.learning.dataset import Dataset
 from bayesrace.learning.sources import CYCLES, STATES, dataset_from_columns
@@ -156,12 +156,10 @@ class Collector:
         states, lap = stretch.states, stretch.lap
         run, first, last = states[0].run, states[0].seq, states[-1].seq
         cycles = [one for one in self._cycles if one.run == run and one.state_seq >= first]
+        columns = columns_of(State, states, STATES), columns_of(Telemetry, cycles, CYCLES)
         samples, why_not = None, ""
         try:
-            samples = dataset_from_columns(
-                columns_of(State, states, STATES), columns_of(Telemetry, cycles, CYCLES),
-                self._car, self._step_s,
-            )  # fmt: skip
+            samples = dataset_from_columns(*columns, self._car, self._step_s)
             if not len(samples):
                 reason = max(samples.dropped, key=lambda one: samples.dropped[one])
                 why_not = _REMEDIES.get(reason, f"the samples are left out: {reason}")
@@ -175,9 +173,7 @@ class Collector:
             lap.versions, lap.fallbacks = list(stretch.versions), len(fallbacks)
             if samples is not None:
                 lap.samples, lap.left_out = len(samples), samples.dropped
-            if self._track is not None and not (samples is None and states[0].estimated):
-                xy_m = np.array([state.x[:2] for state in states if not state.estimated])
-                if samples is not None and samples.estimates is not None:
-                    xy_m = samples.x[:, :2]
-                path = self._track.project_path(xy_m)
+            known = with_estimates(*columns)["x"]
+            if self._track is not None and len(known):
+                path = self._track.project_path(known[:, :2])
                 lap.off_track_m = max(float(np.max(path.off_track_m)), 0.0)
