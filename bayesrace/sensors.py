@@ -37,6 +37,8 @@ FIELDS: Final = {
 
 _MOST_INSTRUMENTS: Final = 8
 """BR_INSTRUMENTS in controller/native/bayesrace_estimator.h."""
+_EVENTS: Final = 60
+"""A few less than BR_EVENTS there."""
 MOST_READINGS: Final = 16
 """Readings in one state (``bayesrace.messages.State``)."""
 
@@ -154,6 +156,13 @@ class Sensors(RootModel[dict[_Name, Instrument]]):
                 f"{MOST_READINGS} each: lower rate_hz of {', '.join(self.root)} to "
                 f"{MOST_READINGS * states_hz:g} Hz together"
             )
+        kept_s = _EVENTS / (rate_hz + states_hz)
+        for name, one in self.root.items():
+            if (late_s := one.delay_s + one.jitter_s) > kept_s:
+                raise InputError(
+                    f"sensors.{name} is {late_s:g} s late, and an estimator that gets so many "
+                    f"readings looks back {kept_s:.2g} s: lower delay_s, or rates"
+                )
 
 
 EXACT: Final = Sensors({})

@@ -166,6 +166,11 @@ class Driver:
         return SENSOR_FAULTS[fault]
 
     @property
+    def doubted(self) -> bool:
+        """Whether the newest state is not to be driven by."""
+        return bool(self._counters.doubted)
+
+    @property
     def fault_text(self) -> str:
         """The same as a sentence."""
         fault, library = self._counters.fault, self._library
@@ -231,11 +236,11 @@ class Driver:
             self._by_weights = by_weights
             self.estimate(*self._estimator.settings(nominal=not by_weights))
 
-    def _measurement(self, reading: Reading) -> Measurement | None:
-        """None: of one instrument too many."""
-        number = self._instruments.setdefault(reading.instrument, len(self._instruments))
+    def _measurement(self, reading: Reading, known: dict[str, int]) -> Measurement | None:
+        """``known``: numbers by name, to which it is added. None: of one instrument too many."""
+        number = known.setdefault(reading.instrument, len(known))
         if number >= MOST_INSTRUMENTS:
-            del self._instruments[reading.instrument]
+            del known[reading.instrument]
             self.readings_left_out += 1
             return None
         values = reading.values
@@ -267,8 +272,9 @@ class Driver:
     def observe(self, state: State) -> bool:
         """Takes a state that has arrived; False if it is not to be driven on."""
         measured, delays_s = self._measured, state.actuation_delays[2::3]
-        if state.estimated and (self.newest is None or state.run != self.newest.run):
-            self._trust_model()
+        newest = self.newest
+        begins = newest is None or (state.epoch, state.run) != (newest.epoch, newest.run)
+        instruments = {} if begins else self._instruments
         measured.epoch, measured.run, measured.seq = state.epoch, state.run, state.seq
         measured.time_s, measured.lockstep = state.time_s, state.lockstep
         measured.x, measured.u_applied = state.x, state.u_applied
@@ -276,7 +282,8 @@ class Driver:
         measured.delays_s[0 : len(delays_s)] = delays_s
         measured.estimated, measured.measurements = state.estimated, 0
         if state.estimated:
-            known = [one for one in map(self._measurement, state.readings) if one is not None]
+            found = (self._measurement(one, instruments) for one in state.readings)
+            known = [one for one in found if one is not None]
             measured.measurements = fill(measured.measured, known)
         library = self._library
         reception = library.br_cycle_observe(self._cycle, measured)
@@ -287,7 +294,9 @@ class Driver:
         if reception != library.BR_STATE_NEW:
             self._refused = state
             return False
-        self.newest, self.belief = state, None
+        self.newest, self.belief, self._instruments = state, None, instruments
+        if begins and state.estimated:
+            self._trust_model()
         if state.estimated:
             estimator = library.br_cycle_estimator(self._cycle)
             self.belief = read(self.controller.artefact, estimator, self._believed)

@@ -175,7 +175,7 @@ class ControllerProcess:
 
     def _recorded(self, state: State, arrived_ns: int) -> State:
         self._service.report_fault()
-        if self._adoption is not None and not self._driver.fault:
+        if self._adoption is not None and not self._driver.doubted:
             self._adoption.observe(self._driver.vx_mps, self._driver.fallen_back)
         self._arrived_ns = self._service.arrived_ns = arrived_ns
         return state

@@ -1,9 +1,11 @@
 """A real car behind the plant process: its instruments in plant time, and commands as they come.
 
 Who has such a car writes a subclass of :class:`Hardware` that speaks the car's own protocol
-(examples/mocap_car/plant.py). All else is as for a simulated car: guard, braking plan, runs, laps.
+(examples/mocap_car/mocap_plant.py). All else is as for a simulated car: guard, braking plan, runs,
+laps.
 """
 
+import logging
 import math
 import threading
 import time
@@ -24,12 +26,18 @@ from bayesrace.vehicles.parameters import CarParameters
 
 __all__ = ["Hardware", "Report"]
 
+_log = logging.getLogger("bayesrace.plant")
+
+_AGAIN_S: Final = 0.1
+"""After a report that could not be received."""
 _MOST: Final = 16
 """Readings that one state has room for; the newest count."""
 _WINDOW_NS: Final = 5_000_000_000
 """For so long the least delay of a clock counts: clocks drift apart by up to 0.1 ms a second."""
 _RESTARTED_NS: Final = 1_000_000_000
 """A delay that is longer by this is a clock that has been set anew."""
+_LATEST_S: Final = 1e9
+"""A clock that is farther from 0 is none."""
 _POSE: Final = ("x", "y", "psi")
 _POSES: Final = 12
 """Newest poses, by which the speed is known ..."""
@@ -141,7 +149,14 @@ class Hardware(Vehicle):
 
     def _listen(self) -> None:
         while not self._closing.is_set():
-            if (report := self.receive()) is not None:
+            try:
+                report = self.receive()
+            except Exception as error:  # of a protocol that is not ours: the car stops unseen
+                self.unusable += 1
+                _log.warning("instruments: %s: %s", type(error).__name__, error)
+                self._closing.wait(_AGAIN_S)
+                continue
+            if report is not None:
                 self._reports.append((report, time.monotonic_ns()))
 
     # What the car says -------------------------------------------------------------------------
@@ -176,15 +191,15 @@ class Hardware(Vehicle):
         return ", ".join(words) or "nothing heard of the car"
 
     def _take_reports(self) -> None:
-        while self._reports:
+        for _ in range(len(self._reports)):  # no more, whatever comes meanwhile
             one, arrived_ns = self._reports.popleft()
-            values = dict(one.values)
-            numbers = [one.clock_s or 0.0, *(x for pair in values.values() for x in pair)]
             try:
-                if not all(map(math.isfinite, numbers)):
-                    raise ValueError("not finite")
-                found = msgspec.convert({"instrument": one.instrument, "time_s": 0.0,
-                                         "values": values}, Reading)  # fmt: skip
+                values = dict(one.values)
+                found = msgspec.convert(
+                    {"instrument": one.instrument, "time_s": 0.0, "values": values}, Reading
+                )
+                if one.clock_s is not None and not abs(one.clock_s) <= _LATEST_S:
+                    raise ValueError("no clock")
             except (ValueError, TypeError):
                 self.unusable += 1
                 continue

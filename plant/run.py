@@ -234,9 +234,10 @@ class Run:
 
     def _halting(self, end: End | None) -> End | None:
         """A run of a real car does not end before it stands, unless it is asked to twice."""
-        if end is None or self._hardware is None or self._lost_s is not None:
+        if end is None or self._hardware is None or self._over is not None or not self._rolls:
             return end
-        self._lost_s, self._over = self.time_s, end
+        self._lost_s = self.time_s if self._lost_s is None else self._lost_s
+        self._over = end
         return None
 
     def _anchor(self, start_ns: int) -> None:

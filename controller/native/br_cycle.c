@@ -152,6 +152,7 @@ br_mpc_error br_cycle_set_estimation(br_cycle *cycle, const br_mpc *model,
     br_estimator *estimator = &cycle->estimator;
     const br_mpc_error error =
         br_estimator_init(estimator, sizeof *estimator, model ? model : cycle->mpc, &estimator);
+    cycle->unknown |= cycle->stream.newest.estimated;
     return error ? error : br_estimator_set(estimator, settings);
 }
 
@@ -223,13 +224,14 @@ static void foresee(br_cycle *cycle) {
 static const double *estimate(br_cycle *cycle, const br_measured *before) {
     br_measured *newest = &cycle->stream.newest;
     static const double none[BR_NX] = {0};
-    const int begins = cycle->unknown;
+    const int begins = cycle->unknown, given = newest->measurements;
+    const int most = given < BR_MEASUREMENTS ? given : BR_MEASUREMENTS;
     memcpy(newest->x, cycle->unknown ? none : before->x, sizeof newest->x);
     foresee(cycle);
     br_estimator *estimator = &cycle->estimator;
-    const br_mpc_error error = br_estimator_advance(estimator, newest->time_s, newest->u_applied,
-                                                    cycle->has_variance ? cycle->variance : NULL,
-                                                    newest->measured, newest->measurements);
+    const br_mpc_error error =
+        br_estimator_advance(estimator, newest->time_s, newest->u_applied,
+                             cycle->has_variance ? cycle->variance : NULL, newest->measured, most);
     cycle->unknown = error != BR_OK || estimator->astray;
     cycle->has_variance = 0;
     cycle->doubt = BR_FAULT_NONE;
@@ -272,10 +274,13 @@ br_reception br_cycle_observe(br_cycle *cycle, const br_measured *state) {
     const br_fault doubted = cycle->doubt;
     const int unknown = cycle->unknown;
     const double *noise = NULL;
-    if (state->estimated)
+    if (state->estimated) {
         noise = estimate(cycle, &before);
-    else
+    } else {
+        cycle->unknown = 0;
         believe(cycle, interval_s);
+    }
+    cycle->counters.doubted = cycle->unknown || cycle->doubt;
     const int begun = state->estimated && !cycle->estimator.agreed; /* here, perhaps elsewhere */
     if (doubted || unknown || cycle->unknown || cycle->doubt || begun)
         cycle->shown.duration_s = 0;
@@ -306,7 +311,10 @@ void br_cycle_go(br_cycle *cycle) {
     if (!cycle) return;
     cycle->halted = cycle->stopping = 0;
     br_monitor_restart(&cycle->monitor); /* whoever says go has looked at the sensors */
-    if (cycle->doubt && cycle->stream.newest.estimated) br_estimator_reset(&cycle->estimator);
+    if (!cycle->stream.newest.estimated) return;
+    if (!cycle->doubt && !cycle->unknown && !cycle->estimator.latched) return;
+    br_estimator_reset(&cycle->estimator);
+    cycle->unknown = 1;
 }
 
 /* --- one cycle --- */

@@ -280,7 +280,7 @@ static void begin_moving(const br_measurement *before, const br_measurement *m, 
 static void begin(br_estimator *estimator, const br_measurement *m, const br_measurement *before) {
     br_event first = {.time_s = m->time_s};
     br_estimate *b = &first.after;
-    br_estimator_reset(estimator);
+    br_estimator_reset(estimator); /* never of one that is latched */
     estimator->agreed = estimator->astray = 0;
     estimator->posed_s = m->time_s;
     for (int i = 0; i < BR_NB; ++i)
@@ -309,8 +309,9 @@ static int place(br_estimator *estimator, const br_measurement *m) {
         return -1;
     int k = last;
     while (k > 1 && br_estimator_event(estimator, k - 1)->time_s > m->time_s) --k;
-    if (k == 0) return -1;                              /* nothing has been since the first */
-    br_event given = *br_estimator_event(estimator, k); /* the input is that of its period */
+    if (k == 0) return -1;                                  /* nothing has been since the first, */
+    if (k == 1 && estimator->count == BR_EVENTS) return -1; /* or that has to make room */
+    br_event given = *br_estimator_event(estimator, k);     /* the input is that of its period */
     given.time_s =
         fmin(fmax(m->time_s, br_estimator_event(estimator, k - 1)->time_s), given.time_s);
     given.measured = *m;
@@ -392,8 +393,8 @@ static void judge(br_estimator *estimator, br_event *one) {
     const double gate = (estimator->agreed ? 1 : BEGINNING) * estimator->settings.gate;
     br_estimate with = one->after;
     /* No model is off by so much in a gap, though its covariance may allow an outlier then. */
-    const int possible =
-        !estimator->agreed || br_instrument_near(&one->measured, FARTHEST, &one->after);
+    const int possible = !estimator->agreed || !(gate > 0) ||
+                         br_instrument_near(&one->measured, FARTHEST, &one->after);
     double squared = possible ? take(gate, &one->measured, &with) : -1;
     if (first && squared < 0) one->widening = widen(estimator, one);
     if (squared < 0 && one->widening > 1) {
@@ -401,7 +402,7 @@ static void judge(br_estimator *estimator, br_event *one) {
         with = one->after;
         squared = take(gate, &one->measured, &with);
     }
-    if (first && !count(estimator, one, squared)) one->left_out = squared >= 0;
+    if (first && !count(estimator, one, squared)) one->left_out = squared >= 0 || instrument->fault;
     if (squared >= 0 && !one->left_out) one->after = with;
 }
 
@@ -475,11 +476,13 @@ br_mpc_error br_estimator_advance(br_estimator *estimator, double time_s, const 
     if (!estimator->has_settings) return BR_ERROR_NOT_READY;
     if (!isfinite(time_s)) return BR_ERROR_TIME;
     const int begun = estimator->count;
-    if (begun && time_s < br_estimator_event(estimator, begun - 1)->time_s - SAME_S)
+    if (begun && time_s < br_estimator_event(estimator, begun - 1)->time_s - SAME_S) {
+        estimator->count = 0; /* one of the two dates is wrong */
         return BR_ERROR_TIME;
+    }
     const br_measurement *pose = first_pose(estimator, measurements, count, time_s + SAME_S);
     const int anew = !begun || outdated(estimator, time_s, pose != NULL);
-    if (anew && !pose) {
+    if (anew && (!pose || estimator->latched)) {
         estimator->count = 0;
         for (int i = 0; i < count; ++i) lose(estimator, &measurements[i], time_s);
         return BR_ERROR_NOT_READY;
@@ -497,7 +500,7 @@ br_mpc_error br_estimator_advance(br_estimator *estimator, double time_s, const 
     }
     if (pose) estimator->pose = *pose;
     for (int i = 0; i < BR_INSTRUMENTS; ++i) br_instrument_wait(&estimator->instrument[i], time_s);
-    if (error) br_estimator_reset(estimator);
+    if (error) estimator->count = 0;
     return error;
 }
 

@@ -151,7 +151,10 @@ br_fault br_estimator_blind(const br_estimator *estimator, int *contradicted) {
         for (int a = 0; a < one->held.count; ++a)
             positions |= kind_of(one->held.of[a]) == BR_FAULT_POSITION;
         if (!positions) continue;
-        if (!one->fault) return BR_FAULT_NONE;
+        if (!one->fault) {
+            *contradicted = 0;
+            return BR_FAULT_NONE;
+        }
         found = (br_fault)one->fault;
         *contradicted |= contradicts(found);
     }
