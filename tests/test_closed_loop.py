@@ -125,7 +125,7 @@ def test_a_run_is_that_of_two_processes_over_zenoh_to_the_bit(
     assert first.x[:, 3].max() > 1.8
     assert second.x.shape == (51, 7)
     assert second.u.shape == (*second.levels.shape, 2) == (50, 2)
-    assert not second.statuses[5:].any()  # until then there may be no pose
+    assert not second.statuses[8:].any()  # until then there may be no pose
     measured = np.array([state.x for state in second.states])
     assert np.array_equal(measured, second.x) == (not disturbances)
     assert any(state.readings for state in second.states) == bool(disturbances)

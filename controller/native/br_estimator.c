@@ -17,8 +17,6 @@
 #define SAME_S 1e-9    /* times closer than that are one */
 #define LONGEST_S 1.0  /* without position, or between two periods; after that it begins anew */
 #define BEGINNING 0.25 /* share of the gate until a second pose has agreed with the first */
-#define NEAR 0.5       /* bounds by which a model may be off that says less, */
-#define FARTHEST 3.0   /* and by which none is, whatever it says of itself */
 #define WIDEST 100.0   /* by how much one measurement may widen the covariance */
 #define APART_S 0.2    /* between two poses whose difference is a velocity */
 #define STEERED 4.0    /* so many times the steering angle's deviation has a car that moves */
@@ -364,7 +362,7 @@ static int count(br_estimator *estimator, const br_event *one, double squared) {
 static double widen(const br_estimator *estimator, const br_event *one) {
     const br_measurement *m = &one->measured;
     const double gate = estimator->settings.gate;
-    if (!(gate > 0) || !estimator->agreed || !br_instrument_near(m, NEAR, &one->after)) return 1;
+    if (!(gate > 0) || !estimator->agreed || !br_instrument_near(m, &one->after)) return 1;
     int contradicted;
     if (!estimator->instrument[m->instrument].refused_in_row) return 1;
     if (br_estimator_blind(estimator, &contradicted)) return 1;
@@ -393,8 +391,8 @@ static void judge(br_estimator *estimator, br_event *one) {
     const double gate = (estimator->agreed ? 1 : BEGINNING) * estimator->settings.gate;
     br_estimate with = one->after;
     /* No model is off by so much in a gap, though its covariance may allow an outlier then. */
-    const int possible = !estimator->agreed || !(gate > 0) ||
-                         br_instrument_near(&one->measured, FARTHEST, &one->after);
+    const int possible =
+        !estimator->agreed || !(gate > 0) || br_instrument_possible(&one->measured, &one->after);
     double squared = possible ? take(gate, &one->measured, &with) : -1;
     if (first && squared < 0) one->widening = widen(estimator, one);
     if (squared < 0 && one->widening > 1) {

@@ -58,9 +58,10 @@ void br_instrument_arrive(br_instrument *instrument, const br_measurement *m, do
 int br_instrument_holds(const br_instrument *instrument, const br_measurement *m);
 int br_instrument_repeats(br_instrument *instrument, const br_measurement *m, const br_estimate *b);
 
-/* Whether it differs from what is expected by at most this share of the bounds on contradictions of
- * measured states (br_state.c), besides its noise. */
-int br_instrument_near(const br_measurement *m, double share, const br_estimate *b);
+/* Whether it differs from what is expected by so little that the model may be wrong; or by less
+ * than any model errs in position, whatever it says of itself. */
+int br_instrument_near(const br_measurement *m, const br_estimate *b);
+int br_instrument_possible(const br_measurement *m, const br_estimate *b);
 
 /* What in the measurement is farthest from what is expected. */
 br_fault br_instrument_kind(const br_measurement *m, const br_estimate *b);

@@ -18,6 +18,8 @@
 #define MOVED 4.0      /* standard deviations by which what is measured has changed for certain */
 #define INTERVALS 5.0  /* of silence, ... */
 #define SILENT_S 0.15  /* ... and at least so long: motion capture has gaps of 100 ms */
+#define NEAR 0.5       /* share of the bounds on contradictions of measured states (br_state.c) */
+#define FARTHEST 3.0   /* of that on positions */
 #define FORGETTING 0.1 /* of the mean interval, by each one */
 
 void br_instrument_arrive(br_instrument *instrument, const br_measurement *m, double time_s) {
@@ -72,7 +74,7 @@ static br_fault kind_of(int state) {
     return state == BR_INDEX_DELTA ? BR_FAULT_STEERING : BR_FAULT_VELOCITY;
 }
 
-int br_instrument_near(const br_measurement *m, double share, const br_estimate *b) {
+int br_instrument_near(const br_measurement *m, const br_estimate *b) {
     static const double bounds[] = {[BR_FAULT_POSITION] = BR_MONITOR_POSITION_M,
                                     [BR_FAULT_HEADING] = BR_MONITOR_HEADING_RAD,
                                     [BR_FAULT_VELOCITY] = BR_MONITOR_SPEED_MPS,
@@ -81,7 +83,16 @@ int br_instrument_near(const br_measurement *m, double share, const br_estimate 
     for (int a = 0; a < m->count; ++a) {
         const double off = difference(m, a, b);
         const double noise = 3 * m->deviation[a];
-        if (!(fabs(off) <= share * bounds[kind_of(m->of[a])] + noise)) return 0;
+        if (!(fabs(off) <= NEAR * bounds[kind_of(m->of[a])] + noise)) return 0;
+    }
+    return 1;
+}
+
+int br_instrument_possible(const br_measurement *m, const br_estimate *b) {
+    for (int a = 0; a < m->count; ++a) {
+        const double most_m = FARTHEST * BR_MONITOR_POSITION_M + 3 * m->deviation[a];
+        if (kind_of(m->of[a]) == BR_FAULT_POSITION && !(fabs(difference(m, a, b)) <= most_m))
+            return 0;
     }
     return 1;
 }
