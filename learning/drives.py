@@ -69,6 +69,7 @@ class Measured(NamedTuple):
     states: tuple[int, ...]
     value: Floats
     variance: Floats
+    instrument: str
 
     @classmethod
     def of(cls, reading: Reading) -> "Measured":
@@ -76,7 +77,7 @@ class Measured(NamedTuple):
         names = sorted(reading.values, key=QUANTITIES.index)
         values = np.array([reading.values[name] for name in names], dtype=np.float64)
         rows = tuple(QUANTITIES.index(name) for name in names)
-        return cls(reading.time_s, rows, values[:, 0], values[:, 1] ** 2)
+        return cls(reading.time_s, rows, values[:, 0], values[:, 1] ** 2, reading.instrument)
 
 
 class Event(NamedTuple):

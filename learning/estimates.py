@@ -140,7 +140,7 @@ def _deviation(
     the last state's step there is none."""
     x, u = found.x[:-1, :_NX], drive.u[found.rows[1:]]
     h = np.full((1, len(x)), discretisation.step_s)
-    _, slope, _ = corrected_step(car, discretisation, weights)(x.T, u.T, h)
+    _, slope, _ = corrected_step(car, discretisation, weights)(x.T, x.T, u.T, h)
     spread = np.zeros((len(found.x), 4))
     spread[:-1, :3] = np.sqrt(found.step_variance(stacked(slope, len(x))))
     spread[:, 3] = np.sqrt(found.covariance[:, 6, 6])

@@ -51,7 +51,7 @@ _SEARCHED: Final = 600
 _EXCEEDED: Final = {n: float(chi2.ppf(0.999, n)) for n in range(1, _NX + 1)}
 """Squared distances that one of 1,000 right readings exceeds, as in the C code."""
 _REFUSED: Final = 5
-"""Readings in a row: then it is the filter that is wrong."""
+"""Readings of an instrument in a row: then it is the filter that is wrong."""
 _LINEARISED: Final = 2
 """Passes along the result of the one before."""
 
@@ -108,7 +108,8 @@ def _forward(
     (b, m), e = x0.shape, len(events)
     means, covariances = np.zeros((2, e, b, m)), np.zeros((3, e, b, m, m))
     made = _Forward(means[0], covariances[0], means[1], covariances[1], covariances[2], np.zeros(b))
-    x, p, refused = x0, p0, np.zeros(b, dtype=np.int64)
+    refused = {one.measured.instrument: np.zeros(b, np.int64) for one in events if one.measured}
+    x, p = x0, p0
     made.x[0], made.p[0] = x, p
     for i in range(1, e):
         event = events[i]
@@ -120,7 +121,8 @@ def _forward(
             made.f[i] = np.eye(m)
         made.ahead[i], made.p_ahead[i] = x, p
         if event.measured is not None:
-            x, p = _updated(x, p, event.measured, gate, made.likelihood, refused)
+            own = refused[event.measured.instrument]
+            x, p = _updated(x, p, event.measured, gate, made.likelihood, own)
         made.x[i], made.p[i] = x, p
     return made
 
@@ -128,8 +130,8 @@ def _forward(
 def _updated(
     x: Floats, p: Floats, measured: Measured, gate: float, likelihood: Floats, refused: Rows
 ) -> tuple[Floats, Floats]:
-    """With a reading, where the gate lets it pass, or has refused too many in a row (``refused``,
-    (b,)); adds to the likelihoods (b,)."""
+    """With a reading, where the gate lets it pass, or has refused too many of its instrument in a
+    row (``refused``, (b,)); adds to the likelihoods (b,)."""
     of, m = measured.states, x.shape[1]
     h, r = _observation(of, m), np.diag(measured.variance)
     hp = h @ p
@@ -246,9 +248,11 @@ def _corrected(
 ) -> _Transition:
     """The corrected model, linearised along the path."""
     before, (u, h), e = path[:-1], _columns(events[1:]), len(events) - 1
+    ends = [i if i == 0 or one.period >= 0 else 0 for i, one in enumerate(events[:-1])]
+    begin = path[np.maximum.accumulate(ends), :_NX]
     step = corrected_step(car, discretisation, weights)
-    ahead, slope, by_error = step(before[:, :_NX].T, u, h)
-    sigma = predictive_sigma(weights, np.column_stack([before[:, 3:_NX], u.T]))
+    ahead, slope, by_error = step(before[:, :_NX].T, begin.T, u, h)
+    sigma = predictive_sigma(weights, np.column_stack([begin[:, 3:], u.T]))
     spread = stacked(by_error, e) * sigma[:, None] * np.sqrt(h.T / discretisation.step_s)[:, None]
     f, q = np.tile(np.eye(_NB), (e, 1, 1)), np.zeros((e, _NB, _NB))
     f[:, :_NX, :_NX] = stacked(slope, e)
@@ -267,14 +271,22 @@ def _corrected(
 def corrected_step(
     car: CarParameters, discretisation: Discretisation, weights: GpWeights | None
 ) -> ca.Function:
-    """(x, u, h) -> x_next, its derivatives by x (7, 7), and by the error of a step (7, 3)."""
-    x, u, h, e = (ca.MX.sym(*one) for one in (("x", 7), ("u", 2), ("h", 1), ("e", 3)))
+    """(x, begin, u, h) -> x_next, its derivatives by x (7, 7), and by the error of a step (7, 3).
+
+    ``begin`` (7,): where the period has begun that h is a part of. Its residual counts in all its
+    parts, because it is learned as that of a whole period; it moves with x.
+    """
+    x, way, u, h, e = (
+        ca.MX.sym(*one) for one in (("x", 7), ("way", 7), ("u", 2), ("h", 1), ("e", 3))
+    )
     share = h / discretisation.step_s
-    mean = 0 if weights is None else share * mean_function(weights)(ca.vertcat(x[3:7], u))
+    z = ca.vertcat((x - way)[3:], u)
+    mean = 0 if weights is None else share * mean_function(weights)(z)
     ahead = discretisation.over(NOMINAL(car))(x, u, mean + e, h)
     found = [ahead, ca.jacobian(ahead, x), ca.jacobian(ahead, e)]
-    at = ca.Function("at", [x, u, h, e], [ca.densify(one) for one in found])
-    return ca.Function("step", [x, u, h], list(at(x, u, h, ca.DM.zeros(3))))
+    at = ca.Function("at", [x, way, u, h, e], [ca.densify(one) for one in found])
+    begin = ca.MX.sym("begin", 7)
+    return ca.Function("step", [x, begin, u, h], list(at(x, x - begin, u, h, ca.DM.zeros(3))))
 
 
 def _walk() -> ca.Function:

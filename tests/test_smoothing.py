@@ -92,10 +92,12 @@ def dense(
     for i, event in enumerate(events[1:], start=1):
         f, q, h = np.eye(9), np.zeros((9, 9)), event.duration_s
         x = mean[-1]
+        if i == 1 or events[i - 1].period >= 0:
+            start = path[i - 1, :7]
         if h > 0:
             before = path[i - 1, :7]
-            variance = predictive_sigma(weights, np.r_[before[3:], event.u][None])[0] ** 2
-            ahead, f[:7, :7], q[:7, :7] = step.propagate(before, event.u, h, variance)
+            variance = predictive_sigma(weights, np.r_[start[3:], event.u][None])[0] ** 2
+            ahead, f[:7, :7], q[:7, :7] = step.propagate(before, event.u, h, variance, start)
             q += np.diag(np.square(drift)) * h
             x = np.r_[ahead, path[i - 1, 7:]] + f @ (mean[-1] - path[i - 1])
         mean.append(x)
@@ -103,7 +105,7 @@ def dense(
             blocks[i, j] = f @ (blocks[i - 1, j] if (i - 1, j) in blocks else blocks[j, i - 1].T)
         blocks[i, i] = f @ blocks[i - 1, i - 1] @ f.T + q
         if event.measured is not None:
-            for state, value, var in zip(*event.measured[1:], strict=True):
+            for state, value, var in zip(*event.measured[1:4], strict=True):
                 row = np.zeros((len(events), 9))
                 row[i, state] = 1
                 row[i, 7] = state == 5
@@ -150,6 +152,22 @@ def test_it_is_what_all_readings_at_once_say(
         if k:
             unit = np.outer(scale[k], scale[k - 1])
             assert np.abs((found.cross[k - 1] - blocks[i, :, ends[k - 1]]) / unit).max() < 1e-3
+
+
+def test_what_one_instrument_reads_does_not_keep_another_from_being_heard(
+    car: CarParameters,
+) -> None:
+    """The pose jumps for good while a gyro, whose readings pass, reads between the poses."""
+    random, readings = np.random.default_rng(1), []
+    x = np.zeros((100, 7))
+    x[:, 3], x[:, 0] = 1, STEP_S * np.arange(100)
+    x[50:, 1] += 0.5
+    for k, one in enumerate(x):
+        readings.append(read(random, STEP_S * k, NAMES[:3], one, POSE))
+        readings.append(read(random, STEP_S * k + 0.01, ("omega",), one, (0.02,)))
+    found = smooth(of(x, np.zeros((99, 2)), readings), car, PREDICTION, None)
+    assert found is not None
+    assert np.abs(found.x[-1, 1] - 0.5) < 0.01
 
 
 @pytest.mark.parametrize("by", [POSE, (0.001, 0.001, np.deg2rad(0.5))])
