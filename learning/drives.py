@@ -32,8 +32,14 @@ class Drive:
     u: Floats
     readings: tuple[Reading, ...]
     steering_rad: float = 0.0
+    steering_deviation_rad: float = 0.0
     path: Floats | None = None
     """At each event, as smoothed at first."""
+
+    def turned_rad(self, time_s: float) -> float:
+        """What the steering has turned since the first state, as it was commanded."""
+        passed = np.clip(time_s - self.time_s[:-1], 0, np.diff(self.time_s))
+        return float(passed @ self.u[1:, 1])
 
     @cached_property
     def events(self) -> "list[Event]":

@@ -43,9 +43,9 @@ def smoothed_states(
     exact = Estimates.exact(len(states))
     drives: list[Drive] = []
     for rows in _unbroken(states, step_s):
-        drive = _drive(states[rows], cycles)
-        found = smooth(drive, car, discretisation, None)
-        if found is None:
+        drive = _drive(states[rows], cycles, step_s)
+        found = None if drive is None else smooth(drive, car, discretisation, None)
+        if drive is None or found is None:
             continue
         own = rows[found.rows]
         filled["x"][own], known[own] = found.x[:, :_NX], True
@@ -120,13 +120,22 @@ def _unbroken(states: Columns, step_s: float) -> list[Rows]:
     return [part for part in parts if states["estimated"][part[0]]]
 
 
-def _drive(states: Columns, cycles: Columns) -> Drive:
-    first = states[0]
-    own = cycles[(cycles["run"] == first["run"]) & (cycles["state_seq"] == first["seq"])]
-    believed: tuple[float, ...] = (own["estimate"][0] if len(own) else ()) or ()
+def _drive(states: Columns, cycles: Columns, step_s: float) -> Drive | None:
+    """None where the steering angle is not known at its first state: neither is that a run's, whose
+    wheels are straight, nor has a controller estimated any."""
+    run, seq, time_s, u = (states[name].copy() for name in ("run", "seq", "time_s", "u_applied"))
     readings = tuple(one for several in states["readings"] for one in several)
-    steering_rad = believed[6] if believed else 0.0
-    return Drive(states["time_s"].copy(), states["u_applied"].copy(), readings, steering_rad)
+    if time_s[0] < step_s - ROUNDING:
+        return Drive(time_s, u, readings)
+    own = (cycles["run"] == run[0]) & (cycles["state_seq"] >= seq[0])
+    own = cycles[own & (cycles["state_seq"] <= seq[-1])]
+    known = [one for one in own if one["estimate"] and one["deviation"]]
+    if not known:
+        return None
+    first = min(known, key=lambda one: int(one["state_seq"]))
+    turned_rad = step_s * u[1 : first["state_seq"] - seq[0] + 1, 1].sum()
+    angle_rad = float(first["estimate"][6] - turned_rad)
+    return Drive(time_s, u, readings, angle_rad, float(first["deviation"][6]))
 
 
 def _deviation(

@@ -17,7 +17,8 @@ makes the readings most likely. The nominal model would bend the velocities to i
 is just what is to be learned. **With weights** it is the corrected model, with the variance that
 the weights state and the walk of ``car.tuning.estimator``, linearised along the first result.
 
-Steering that no instrument reads is what was commanded, from what is known of it at the start.
+Steering that no instrument reads is what was commanded, from what is known of it at the start: at a
+run's the wheels are straight, later the controller's estimate is as good as it states.
 """
 
 from collections.abc import Callable, Sequence
@@ -222,8 +223,10 @@ def _start(first: Event, drive: Drive, car: CarParameters, around: Floats) -> tu
     read = {name for one in drive.readings for name in one.values}
     for offset, name in ((7, "omega"), (8, "delta")):
         x[offset], p[offset, offset] = 0.0, p[offset, offset] * (name in read)
-    p[6, 6] *= "delta" in read
+    if "delta" not in read or drive.steering_deviation_rad > 0:
+        p[6, 6] = drive.steering_deviation_rad**2
     if (pose := first.measured) is not None:
+        x[6] += drive.turned_rad(pose.time_s)
         x[:3], p[:3, :3] = pose.value[:3], np.diag(pose.variance[:3])
     return x, p
 

@@ -58,7 +58,7 @@ TRUE_STATES: Final = "seq run time_s x u_applied"
 """Columns of the true states that samples can be made of, ..."""
 STATES: Final = f"{TRUE_STATES} estimated readings"
 """... of those that a controller sees ..."""
-CYCLES: Final = "run state_seq fallback sensor_fault estimate"
+CYCLES: Final = "run state_seq fallback sensor_fault estimate deviation"
 """... and of the telemetry, which says what is left out of them, and what was estimated."""
 
 _DOUBTFUL: Final = 16

@@ -36,7 +36,7 @@ from bayesrace.operation.closed_loop import ClosedLoop
 from bayesrace.vehicles import CarParameters
 from bayesrace.vehicles.models import dynamic
 from tests.conftest import Make, smooth_drive
-from tests.driven import CAR, QUICK, STEP_S, drive, logged
+from tests.driven import CAR, QUICK, STEP_S, drive, logged, telemetry
 from tests.racing import Racing, prepared, racing
 
 POSE = (0.0005, 0.0005, np.deg2rad(0.2))
@@ -87,7 +87,7 @@ def dense(
     p[:3, :3], p[6, 6], p[8, 8] = np.diag(np.square(POSE)), 0, 0
     first = events[0].measured
     assert first is not None
-    mean = [np.r_[first.value, path[0, 3:6], 0, 0, 0]]
+    mean = [np.r_[first.value, path[0, 3:6], first.time_s * one.u[1, 1], 0, 0]]
     blocks, rows, new, noise = {(0, 0): p}, list[Floats](), list[float](), list[float]()
     for i, event in enumerate(events[1:], start=1):
         f, q, h = np.eye(9), np.zeros((9, 9)), event.duration_s
@@ -238,23 +238,30 @@ class Blind(ClosedLoop):
         return self._observe(self._states[-1])
 
 
-def samples_of(states: Sequence[State]) -> Dataset:
-    columns = columns_of(State, states, STATES), columns_of(Telemetry, (), CYCLES)
+def samples_of(states: Sequence[State], cycles: Sequence[Telemetry] = ()) -> Dataset:
+    columns = columns_of(State, states, STATES), columns_of(Telemetry, cycles, CYCLES)
     return dataset_from_columns(*columns, CAR, STEP_S)
 
 
 def test_estimated_states_of_a_log_are_smoothed_and_their_noise_is_learned_with(
     tmp_path: Path,
 ) -> None:
-    """Without any estimate of a controller's; a lost state ends a drive and begins another."""
+    """A lost state ends a drive and begins another, whose steering angle the controller's first
+    estimate in it says."""
     data = drive(dynamic(CAR), 240, seed=3)
     states = seen(data, 1)
-    samples = samples_of([*states[:150], *states[151:]])
+    lost = [*states[:150], *states[151:]]
+    assert len(samples_of(lost)) < 150
+    estimate, deviation = (*data.x[160], 0.0, 0.0), (*[0.0] * 6, 0.004, 0.0, 0.0)
+    cycle = structs.replace(telemetry(0, 160, 0), estimate=estimate, deviation=deviation)
+    samples = samples_of(lost, [cycle])
     estimates = samples.estimates
     assert estimates is not None
     assert len(samples) > 200
     assert samples.dropped["gap"] == 1
     rows = np.array([0, 151])[estimates.origin[:, 0]] + estimates.origin[:, 1]
+    assert np.abs(samples.x[:, 6] - data.x[rows, 6]).max() < 1e-9
+    assert samples.deviation[:, 3] == pytest.approx(np.where(rows < 150, 0, 0.004))
     off = np.abs(samples.x[:, 3:6] - data.x[rows, 3:6])
     assert (np.sqrt((off**2).mean(axis=0)) < (0.02, 0.02, 0.2)).all()
     assert (samples.deviation[:, :3] > 0).all()
