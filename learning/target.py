@@ -167,8 +167,23 @@ class Target:
             sigma = np.sqrt(sigma**2 + known)
         return PredictionErrors(self.y[tests] - mean, sigma)
 
+    @property
+    def unknown(self) -> float:
+        """Variance that is published as noise for what is not known of samples: the median."""
+        return float(np.median(self.known))
+
+    def published_errors(self, rows: Rows, covariance: Covariance) -> PredictionErrors:
+        """:meth:`errors_from` with the standard deviations that are published, in which all samples
+        are known as well as :attr:`unknown` says."""
+        errors = self.errors_from(rows, covariance)
+        if not self.known.any():
+            return errors
+        same = replace(self, known=np.zeros_like(self.known))
+        published = replace(covariance, noise=covariance.noise + self.unknown)
+        return replace(errors, sigma=same.errors_from(rows, published).sigma)
+
     def metrics(self, errors: PredictionErrors) -> dict[str, float]:
-        """Scores of :meth:`errors_from` in SI units, each fold's variances scaled by the others."""
+        """Scores of such errors in SI units, each fold's variances scaled by the others."""
         held = errors.calibrated(self.folds[self.tests])
         return held.metrics(self.y[self.tests], self.y_mean, self.y_scale)
 

@@ -255,13 +255,13 @@ def _learned(
     """Factorises the samples ``rows`` with the chosen hyperparameters, calibrates the variance,
     scores the result. ``inputs``: the features of these samples in SI units."""
     covariance = fit.covariance
-    errors = target.errors_from(rows, covariance)
+    errors = target.published_errors(rows, covariance)
     scale = errors.variance_scale * widen**2
     output = GpOutput(
         kernel=fit.kind,
         length_scales=covariance.lengths * target.z_scale,
         signal_variance=covariance.signal * scale,
-        noise_variance=(covariance.noise + float(np.median(target.known))) * scale,
+        noise_variance=(covariance.noise + target.unknown) * scale,
         inputs=inputs,
         alpha=target.posterior(rows, covariance).alpha / scale,
         y_mean=target.y_mean,
