@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 from bayesrace.arrays import Floats, Rows
 from bayesrace.messages import QUANTITIES, Reading
 
-__all__ = ["Drive", "Estimates", "Event", "Measured"]
+__all__ = ["POSE", "Drive", "Estimates", "Event", "Measured"]
 
-_POSE: Final = (0, 1, 2)
+POSE: Final = (0, 1, 2)
+"""Numbers of the states that are position and heading."""
 _SAME_S: Final = 1e-9
 _LEAST: Final = 10
 """Readings that a drive needs."""
@@ -97,7 +98,7 @@ class Event(NamedTuple):
 
 def _first_pose(read: Sequence[Measured]) -> int | None:
     """The first of two poses in a row that agree: none of them is an outlier then."""
-    poses = [k for k, one in enumerate(read) if one.states[:3] == _POSE]
+    poses = [k for k, one in enumerate(read) if one.states[:3] == POSE]
     for before, after in pairwise(poses):
         one, other = read[before], read[after]
         most_m = _FASTEST_MPS * (other.time_s - one.time_s) + 6 * np.sqrt(one.variance[:2].max())

@@ -1,9 +1,12 @@
 """States of a drive from what instruments have read in it, all of them used for every state.
 
 A controller's estimate at a moment uses what was read before; learning can use what was read after
-it as well. A forward pass is the extended Kalman filter of controller/native/br_estimator.c (nine
-numbers: the states, and the offsets of the measured yaw rate and steering angle; the same gate), in
-order of measurement, so that no reading is late. A backward pass, Rauch, Tung and Striebel's, takes
+it as well. A forward pass is an extended Kalman filter as that of controller/native/br_estimator.c
+(nine numbers: the states, and the offsets of the measured yaw rate and steering angle; the same
+gate; the residual of a period's beginning in all its parts), in order of measurement, so that no
+reading is late. Other than that one it begins vaguely, at speed, never widens its covariance, takes
+a reading after five of its instrument that were refused, and judges no instrument otherwise; nor
+does it keep the car to its limits. A backward pass, Rauch, Tung and Striebel's, takes
 in what came later (Särkkä, "Bayesian Filtering and Smoothing", section 9.1): with the gain
 
     G_k = P_k F_k' P_(k+1|k)^-1
@@ -23,6 +26,7 @@ run's the wheels are straight, later the controller's estimate is as good as it 
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import product
 from typing import Any, Final
 
@@ -34,7 +38,7 @@ from bayesrace.arrays import Floats, Rows
 from bayesrace.gp.expression import mean_function
 from bayesrace.gp.weights import GpWeights
 from bayesrace.integrators import Discretisation, pose_from_velocities
-from bayesrace.learning.drives import Drive, Event, Measured
+from bayesrace.learning.drives import POSE, Drive, Event, Measured
 from bayesrace.learning.validation import NOMINAL, predictive_sigma
 from bayesrace.vehicles.parameters import CarParameters
 from bayesrace.vehicles.parts import GRAVITY_MPS2
@@ -47,8 +51,9 @@ _VAGUE: Final = 10.0
 """Times the tuning's deviations of a start from rest: a drive may begin at speed."""
 _JERK_S: Final = 0.1
 """In which accelerations change by their full range: the middle of the search."""
-_SEARCHED: Final = 600
-"""Events of a drive that the noise of the random walk is found by."""
+_SEARCHED: Final = (4, 75)
+"""Windows of a drive, evenly spread, and periods in each, that the random walk's noise is found
+by."""
 _EXCEEDED: Final = {n: float(chi2.ppf(0.999, n)) for n in range(1, _NX + 1)}
 """Squared distances that one of 1,000 right readings exceeds, as in the C code."""
 _REFUSED: Final = 5
@@ -331,19 +336,37 @@ def _walked(events: Sequence[Event], drive: Drive, car: CarParameters) -> Smooth
         return np.asarray(ahead).T, np.asarray(f), np.tensordot(middle, q, 1)
 
     path = _backward(events, _forward(events, x0[None], p0[None], stepwise, gate)).path
-    some = events[:_SEARCHED]
-    density = middle[None]
+    windows, density = _windows(events), middle[None]
     for factor, count in ((10.0, 5), (3.0, 3), (1.7, 3)):
         steps = factor ** np.arange(-(count // 2), count // 2 + 1)
         grid = np.array(list(product(steps, repeat=3 if count == 3 else 2)))
         grid = grid if count == 3 else grid[:, [0, 0, 1]]
         tried = density * grid
         go = _along(path, walk, u, h, tried)
-        starts = np.tile(x0, (len(tried), 1)), np.tile(p0, (len(tried), 1, 1))
-        found = _forward(some, *starts, go, gate).likelihood
+        p, found = np.tile(p0, (len(tried), 1, 1)), np.zeros(len(tried))
+        for first, last in windows:
+            x = np.tile(path[first] if first else x0, (len(tried), 1))
+            found += _forward(events[first:last], x, p, partial(_later, go, first), gate).likelihood
         density = tried[[int(np.argmax(found))]]
     made = _forward(events, x0[None], p0[None], _along(path, walk, u, h, density), gate)
     return _backward(events, made)
+
+
+def _windows(events: Sequence[Event]) -> list[tuple[int, int]]:
+    """First event, a pose, and end of each window; the first one is where the drive begins."""
+    count, periods = _SEARCHED
+    poses = [i for i, one in enumerate(events) if one.measured and one.measured.states[:3] == POSE]
+    passed = np.cumsum([one.period >= 0 for one in events])
+    if passed[-1] <= count * periods:
+        return [(0, len(events))]
+    begins = np.linspace(0, passed[-1] - periods, count)
+    firsts = [min(poses, key=lambda i: abs(passed[i] - begin)) for begin in begins]
+    return [(i, int(np.searchsorted(passed, passed[i] + periods, "right"))) for i in firsts]
+
+
+def _later(go: _Transition, first: int, i: int, x: Floats) -> tuple[Floats, Floats, Floats]:
+    """Of events that are counted from another one on."""
+    return go(first + i, x)
 
 
 def _along(path: Floats, walk: ca.Function, u: Floats, h: Floats, density: Floats) -> _Transition:
