@@ -2,6 +2,7 @@
 learned model as they are learned from."""
 
 import math
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Final
@@ -10,6 +11,7 @@ import numpy as np
 
 from bayesrace.arrays import Floats, Rows
 from bayesrace.columns import Columns, with_estimates
+from bayesrace.errors import InputError
 from bayesrace.gp.weights import GpWeights
 from bayesrace.integrators import PREDICTION, Discretisation
 from bayesrace.learning.dataset import ROUNDING, Dataset
@@ -18,6 +20,15 @@ from bayesrace.learning.smoothing import Smoothed, corrected_step, smooth, stack
 from bayesrace.vehicles.parameters import CarParameters
 
 __all__ = ["smoothed_again", "smoothed_in_turns", "smoothed_states"]
+
+_NO_POSITION: Final = "no position was read"
+_NO_STEERING: Final = "no steering angle is known"
+_REMEDIES: Final = {
+    _NO_POSITION: "no two poses in a row agree, or too little was read; does motion capture see "
+    "the car, and do its times fit?",
+    _NO_STEERING: "record a run from its start, or the telemetry with it",
+}
+"""By the reason why a part of a drive is left out."""
 
 _NX: Final = 7
 _ROUNDS: Final = 4
@@ -29,15 +40,16 @@ each round."""
 
 def smoothed_states(
     states: Columns, cycles: Columns, car: CarParameters, step_s: float
-) -> tuple[Columns, Estimates | None]:
-    """``states`` with ``x`` smoothed by the random walk where they are estimated, and how well they
-    are known, row by row; those that nothing can be made of are left out.
+) -> tuple[Columns, Estimates | None, Counter[str]]:
+    """``states`` with ``x`` smoothed by the random walk where they are estimated; how well they are
+    known, row by row; and how many are of parts that nothing can be made of, by reason.
 
-    Columns as of :func:`bayesrace.learning.sources.dataset_from_columns`.
+    Columns as of :func:`bayesrace.learning.sources.dataset_from_columns`. InputError if none of the
+    states is left.
     """
-    names = states.dtype.names or ()
+    names, lost = states.dtype.names or (), Counter[str]()
     if "readings" not in names or not states["estimated"].any():
-        return with_estimates(states, cycles), None
+        return with_estimates(states, cycles), None, lost
     discretisation = PREDICTION.model_copy(update={"step_s": step_s})
     known, filled = ~states["estimated"], states.copy()
     exact = Estimates.exact(len(states))
@@ -46,6 +58,7 @@ def smoothed_states(
         drive = _drive(states[rows], cycles, step_s)
         found = None if drive is None else smooth(drive, car, discretisation, None)
         if drive is None or found is None:
+            lost[_NO_STEERING if drive is None else _NO_POSITION] += len(rows)
             continue
         own = rows[found.rows]
         filled["x"][own], known[own] = found.x[:, :_NX], True
@@ -53,7 +66,11 @@ def smoothed_states(
         exact.origin[own, 0], exact.origin[own, 1] = len(drives), found.rows
         drives.append(replace(drive, path=found.path))
     kept = np.flatnonzero(known)
-    return filled[kept], Estimates(exact.deviation, exact.origin, tuple(drives)).select(kept)
+    if lost and not len(kept):
+        reason = max(lost, key=lambda one: lost[one])
+        raise InputError(f"{reason}: {_REMEDIES[reason]}")
+    estimates = Estimates(exact.deviation, exact.origin, tuple(drives)).select(kept)
+    return filled[kept], estimates, lost
 
 
 def smoothed_again(

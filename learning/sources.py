@@ -72,8 +72,8 @@ _ABOUT: Final = ("car", "step_s")
 _SAMPLES: Final = ("x", "u", "x_next")
 _DRIVE: Final = ("states", "inputs")
 _SCHEMA: Final = (
-    "need 'car', 'step_s', and either 'x' (n, 7), 'u' (n, 2), 'x_next' (n, 7) or "
-    "'states' (n + 1, 7), 'inputs' (n, 2)"
+    "need 'car', 'step_s', and either 'x' (n, 7), 'u' (n, 2), 'x_next' (n, 7), with 'deviation' "
+    "(n, 4) if states are estimated, or 'states' (n + 1, 7), 'inputs' (n, 2)"
 )
 
 
@@ -142,7 +142,7 @@ def dataset_from_columns(
     """
     if runs is not None:
         states = states[np.isin(states["run"], list(runs))]
-    states, estimates = smoothed_states(states, cycles, car, step_s)
+    states, estimates, lost = smoothed_states(states, cycles, car, step_s)
     now, after = states[:-1], states[1:]
     passed_s = after["time_s"] - now["time_s"]
     # A fault of the plant repeats the last state: no time has passed.
@@ -160,13 +160,12 @@ def dataset_from_columns(
             f"{step_s:g} s; drive with --rate {1 / step_s:g}, or learn for the controller that "
             "drove: --artefact"
         )
-    gaps = int(pair.sum() - found.sum())
+    if gaps := int(pair.sum() - found.sum()):
+        lost["gap"] = gaps
     estimates = estimates and estimates.select(np.flatnonzero(found))
     now, after = now[found], after[found]
-    samples = Dataset(
-        car, step_s, now["x"], after["u_applied"], after["x"],
-        dropped={"gap": gaps} if gaps else {}, estimates=estimates,
-    )  # fmt: skip
+    moved = now["x"], after["u_applied"], after["x"]
+    samples = Dataset(car, step_s, *moved, dropped=lost, estimates=estimates)
     return filter_dataset(samples.select(~_left_out(now, cycles), "fallback"), limits=limits)
 
 

@@ -14,6 +14,7 @@ from bayesrace.columns import columns_of
 from bayesrace.controller.assembly import compiled_controller
 from bayesrace.controller.native_step import NativeStep
 from bayesrace.controller.process_settings import ControllerSettings
+from bayesrace.errors import InputError
 from bayesrace.gp.weights import GpWeights
 from bayesrace.integrators import PREDICTION
 from bayesrace.learning import smoothing
@@ -251,7 +252,7 @@ def test_estimated_states_of_a_log_are_smoothed_and_their_noise_is_learned_with(
     data = drive(dynamic(CAR), 240, seed=3)
     states = seen(data, 1)
     lost = [*states[:150], *states[151:]]
-    assert len(samples_of(lost)) < 150
+    assert samples_of(lost).dropped["no steering angle is known"] == 90
     estimate, deviation = (*data.x[160], 0.0, 0.0), (*[0.0] * 6, 0.004, 0.0, 0.0)
     cycle = structs.replace(telemetry(0, 160, 0), estimate=estimate, deviation=deviation)
     samples = samples_of(lost, [cycle])
@@ -276,6 +277,12 @@ def test_estimated_states_of_a_log_are_smoothed_and_their_noise_is_learned_with(
     settled = made.samples.settled().estimates
     assert settled is not None
     assert not settled.drives
+
+
+def test_a_drive_whose_position_was_not_read_says_so() -> None:
+    states = [structs.replace(one, readings=()) for one in seen(drive(dynamic(CAR), 60, seed=3), 1)]
+    with pytest.raises(InputError, match=r"no position was read: .*does motion capture"):
+        samples_of(states)
 
 
 @pytest.mark.check
