@@ -107,8 +107,8 @@ def smoothed_in_turns(
     learn: Callable[[Dataset, GpWeights | None], GpWeights],
 ) -> Dataset:
     """The samples smoothed and learned from in turn: those of the round whose weights make it most
-    likely what was read in the drives. ``weights``: that drove, to begin with; ``learn``: new ones
-    from samples, beginning with others.
+    likely what was read in the drives. ``weights``: that drove, to begin with, their noise taken to
+    be as much less as that of others; ``learn``: new ones from samples, beginning with others.
 
     Variances are not to be widened by ``learn``, and what smoothing leaves unknown is to count as
     noise: else the model would confirm itself, surer each time.
@@ -116,7 +116,8 @@ def smoothed_in_turns(
     best, score = dataset, -math.inf
     for number in range(_ROUNDS):
         if weights is None or number:
-            weights = _surer(learn(dataset, weights))
+            weights = learn(dataset, weights)
+        weights = _surer(weights)
         dataset, found = smoothed_again(dataset, discretisation, weights)
         if found > score:
             best, score = dataset, found
