@@ -32,7 +32,7 @@ from typing import Any, Final
 
 import casadi as ca
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from bayesrace.arrays import Floats, Rows
 from bayesrace.gp.expression import mean_function
@@ -54,7 +54,7 @@ _JERK_S: Final = 0.1
 _SEARCHED: Final = (4, 75)
 """Windows of a drive, evenly spread, and periods in each, that the random walk's noise is found
 by."""
-_EXCEEDED: Final = {n: float(chi2.ppf(0.999, n)) for n in range(1, _NX + 1)}
+_EXCEEDED: Final = {n: float(chdtri(n, 0.001)) for n in range(1, _NX + 1)}
 """Squared distances that one of 1,000 right readings exceeds, as in the C code."""
 _REFUSED: Final = 5
 """Readings of an instrument in a row: then it is the filter that is wrong."""

@@ -24,6 +24,7 @@ paper, wrong for driving our cars. Nor does that drive keep to the limits of the
 import json
 import os
 import zipfile
+from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -44,7 +45,6 @@ from bayesrace.learning.dataset import (
     filter_dataset,
 )  # fmt: skip
 from bayesrace.learning.drives import Estimates
-from bayesrace.learning.estimates import smoothed_states
 from bayesrace.log import LogReader
 from bayesrace.messages import STATE, TELEMETRY, TRUTH, topic_of
 from bayesrace.vehicles import CarParameters, builtin_cars, car_text, described_car
@@ -142,7 +142,13 @@ def dataset_from_columns(
     """
     if runs is not None:
         states = states[np.isin(states["run"], list(runs))]
-    states, estimates, lost = smoothed_states(states, cycles, car, step_s)
+    estimates: Estimates | None = None
+    lost: Counter[str] = Counter()
+    if "estimated" in (states.dtype.names or ()) and states["estimated"].any():
+        # CasADi and more, which a program that reads measured states does not need.
+        from bayesrace.learning.estimates import smoothed_states
+
+        states, estimates, lost = smoothed_states(states, cycles, car, step_s)
     now, after = states[:-1], states[1:]
     passed_s = after["time_s"] - now["time_s"]
     # A fault of the plant repeats the last state: no time has passed.
