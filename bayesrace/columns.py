@@ -52,15 +52,11 @@ def with_estimates(states: Columns, cycles: Columns) -> Columns:
         for run, seq, estimate in cycles[["run", "state_seq", "estimate"]].tolist()
         if estimate
     }
-    whole = ~states["estimated"]
-    keys = states[["run", "seq"]].tolist()
-    kept = np.array([known or key in found for known, key in zip(whole, keys, strict=True)], bool)
+    rows = states[["run", "seq", "estimated"]].tolist()
+    kept = [not estimated or (run, seq) in found for run, seq, estimated in rows]
     filled: Columns = states[kept]
-    for row, key in zip(
-        filled, (key for key, one in zip(keys, kept, strict=True) if one), strict=True
-    ):
-        if row["estimated"]:
-            row["x"] = found[key]
+    for row in np.flatnonzero(filled["estimated"]):
+        filled["x"][row] = found[filled["run"][row], filled["seq"][row]]
     return filled
 
 

@@ -23,6 +23,7 @@ from pydantic import (
 from bayesrace.defaults import Option
 from bayesrace.errors import InputError, faults_in
 from bayesrace.files import parse_toml, read_text, write_whole
+from bayesrace.messages import MOST_INSTRUMENTS, MOST_READINGS
 
 __all__ = [
     "BUILT_IN", "EXACT", "FIELDS", "Channel", "Instrument", "Sensors", "SensorsSetting",
@@ -35,12 +36,8 @@ FIELDS: Final = {
 }  # fmt: skip
 """What can be measured (``bayesrace.messages.QUANTITIES``) to its name in a file."""
 
-_MOST_INSTRUMENTS: Final = 8
-"""BR_INSTRUMENTS in controller/native/bayesrace_estimator.h."""
 _EVENTS: Final = 60
-"""A few less than BR_EVENTS there."""
-MOST_READINGS: Final = 16
-"""Readings in one state (``bayesrace.messages.State``)."""
+"""A few less than BR_EVENTS in controller/native/bayesrace_estimator.h."""
 
 
 class Channel(BaseModel):
@@ -128,7 +125,7 @@ class Sensors(RootModel[dict[_Name, Instrument]]):
 
     model_config = ConfigDict(frozen=True)
 
-    root: dict[_Name, Instrument] = Field({}, max_length=_MOST_INSTRUMENTS)
+    root: dict[_Name, Instrument] = Field({}, max_length=MOST_INSTRUMENTS)
 
     def __hash__(self) -> int:
         return hash(tuple(self.root.items()))

@@ -11,11 +11,18 @@ from dataclasses import dataclass
 from enum import IntEnum, StrEnum
 from typing import Any, Final
 
-from bayesrace.controller.estimator import MOST_INSTRUMENTS, Belief, Measurement, fill, read
+from bayesrace.controller.estimator import Belief, Measurement, fill, read
 from bayesrace.controller.interface import Controller, Environment, StepOutput
 from bayesrace.controller.process_settings import ControllerSettings
 from bayesrace.controller.settings import MpcSettings
-from bayesrace.messages import QUANTITIES, SENSOR_FAULTS, BrakingPlan, Reading, State
+from bayesrace.messages import (
+    MOST_INSTRUMENTS,
+    QUANTITIES,
+    SENSOR_FAULTS,
+    BrakingPlan,
+    Reading,
+    State,
+)
 from bayesrace.transport import Numbering
 from bayesrace.vehicles.parameters import CarParameters
 

@@ -9,10 +9,7 @@ from bayesrace.arrays import Floats
 from bayesrace.controller.native_step import Artefact, NativeProblem
 from bayesrace.errors import InputError
 
-__all__ = ["MOST_INSTRUMENTS", "Belief", "Estimator", "Measurement", "fill", "read"]
-
-MOST_INSTRUMENTS: Final = 8
-"""BR_INSTRUMENTS in controller/native/bayesrace_estimator.h."""
+__all__ = ["Belief", "Estimator", "Measurement", "fill", "read"]
 
 
 class Measurement(NamedTuple):

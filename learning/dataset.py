@@ -9,13 +9,14 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from bayesrace.arrays import Floats
+from bayesrace.arrays import Flags, Floats
+from bayesrace.columns import Columns
 from bayesrace.errors import InputError
 from bayesrace.learning.drives import Estimates
 from bayesrace.vehicles.parameters import CarParameters
 
 __all__ = ["ROUNDING", "SIGMAS", "Dataset", "concatenate", "dataset_from_arrays", "filter_dataset"]
-__all__ += ["left_out"]
+__all__ += ["consecutive", "left_out"]
 
 ROUNDING: Final = 1e-6
 """Permitted error of times, inputs and angles [SI units]; a plant in single precision errs by
@@ -122,6 +123,16 @@ class Dataset:
         for array in (self.x, self.u, self.x_next, *known):
             total.update(array.astype("<f8", order="C").tobytes())
         return total.hexdigest()
+
+
+def consecutive(states: Columns, step_s: float) -> Flags:
+    """Which states (n - 1,) come a period after the one before them, in the same run, with none
+    missing in between. ``states`` has run, seq and time_s."""
+    now, after = states[:-1], states[1:]
+    same_run, next_seq = now["run"] == after["run"], now["seq"] + 1 == after["seq"]
+    on_time = np.abs(after["time_s"] - now["time_s"] - step_s) <= ROUNDING
+    found: Flags = same_run & next_seq & on_time
+    return found
 
 
 def left_out(dropped: Mapping[str, int]) -> str:

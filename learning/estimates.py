@@ -10,11 +10,11 @@ from typing import Final
 import numpy as np
 
 from bayesrace.arrays import Floats, Rows
-from bayesrace.columns import Columns, with_estimates
+from bayesrace.columns import Columns
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import GpWeights
 from bayesrace.integrators import PREDICTION, Discretisation
-from bayesrace.learning.dataset import ROUNDING, Dataset
+from bayesrace.learning.dataset import ROUNDING, Dataset, consecutive
 from bayesrace.learning.drives import Drive, Estimates
 from bayesrace.learning.smoothing import Smoothed, corrected_step, smooth, stacked
 from bayesrace.vehicles.parameters import CarParameters
@@ -40,19 +40,17 @@ each round."""
 
 def smoothed_states(
     states: Columns, cycles: Columns, car: CarParameters, step_s: float
-) -> tuple[Columns, Estimates | None, Counter[str]]:
+) -> tuple[Columns, Estimates, Counter[str]]:
     """``states`` with ``x`` smoothed by the random walk where they are estimated; how well they are
     known, row by row; and how many are of parts that nothing can be made of, by reason.
 
     Columns as of :func:`bayesrace.learning.sources.dataset_from_columns`. InputError if none of the
     states is left.
     """
-    names, lost = states.dtype.names or (), Counter[str]()
-    if "readings" not in names or not states["estimated"].any():
-        return with_estimates(states, cycles), None, lost
+    lost = Counter[str]()
     discretisation = PREDICTION.model_copy(update={"step_s": step_s})
     known, filled = ~states["estimated"], states.copy()
-    exact = Estimates.exact(len(states))
+    deviation, origin = np.zeros((len(states), 4)), np.full((len(states), 2), -1)
     drives: list[Drive] = []
     for rows in _unbroken(states, step_s):
         drive = _drive(states[rows], cycles, step_s)
@@ -62,15 +60,14 @@ def smoothed_states(
             continue
         own = rows[found.rows]
         filled["x"][own], known[own] = found.x[:, :_NX], True
-        exact.deviation[own] = _deviation(found, drive, car, discretisation, None)
-        exact.origin[own, 0], exact.origin[own, 1] = len(drives), found.rows
+        deviation[own] = _deviation(found, drive, car, discretisation, None)
+        origin[own, 0], origin[own, 1] = len(drives), found.rows
         drives.append(replace(drive, path=found.path))
     kept = np.flatnonzero(known)
     if lost and not len(kept):
         reason = max(lost, key=lambda one: lost[one])
         raise InputError(f"{reason}: {_REMEDIES[reason]}")
-    estimates = Estimates(exact.deviation, exact.origin, tuple(drives)).select(kept)
-    return filled[kept], estimates, lost
+    return filled[kept], Estimates(deviation, origin, tuple(drives)).select(kept), lost
 
 
 def smoothed_again(
@@ -131,9 +128,8 @@ def _surer(weights: GpWeights) -> GpWeights:
 
 def _unbroken(states: Columns, step_s: float) -> list[Rows]:
     """Rows of each estimated drive in which no state is missing."""
-    joined = (states["run"][1:] == states["run"][:-1]) & (np.diff(states["seq"]) == 1)
-    joined &= np.abs(np.diff(states["time_s"]) - step_s) <= ROUNDING
-    joined &= states["estimated"][1:] == states["estimated"][:-1]
+    alike = states["estimated"][1:] == states["estimated"][:-1]
+    joined = consecutive(states, step_s) & alike
     parts = np.split(np.arange(len(states)), np.flatnonzero(~joined) + 1)
     return [part for part in parts if states["estimated"][part[0]]]
 

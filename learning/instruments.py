@@ -13,7 +13,7 @@ import numpy as np
 from bayesrace.arrays import AnyArray, Flags, Floats, Rows
 from bayesrace.columns import Columns, LogColumns
 from bayesrace.errors import InputError
-from bayesrace.learning.dataset import ROUNDING
+from bayesrace.learning.dataset import consecutive
 from bayesrace.learning.sources import log_facts
 from bayesrace.messages import QUANTITIES, STATE
 from bayesrace.vehicles import CarParameters, builtin_cars
@@ -133,9 +133,8 @@ def _unbroken(states: Columns, instruments: dict[str, int]) -> list[Recorded]:
     """A run up to its first gap, if there is driving in it."""
     if len(states) < 2:
         return []
-    passed = np.diff(states["time_s"])
-    step_s = float(np.median(passed))
-    apart = (np.abs(passed - step_s) > ROUNDING) | (np.diff(states["seq"]) != 1)
+    step_s = float(np.median(np.diff(states["time_s"])))
+    apart = ~consecutive(states, step_s)
     last = int(apart.argmax()) if apart.any() else len(apart)
     if last < 1:
         return []

@@ -28,7 +28,6 @@ __all__ = ["LONGEST_DELAY_S", "Motion", "Numbers", "SingleTrack", "rates"]
 LONGEST_DELAY_S: Final = 0.25
 """Between a command and the car."""
 
-_SUBSTEPS: Final = 1
 _HEADING, _YAW_RATE, _STEERING = (QUANTITIES.index(one) for one in ("psi", "omega", "delta"))
 
 
@@ -172,35 +171,31 @@ class SingleTrack:
         for period in range(self._periods):
             for part, (h, commands, angles) in enumerate(parts, 2 - len(parts)):
                 d = commands[..., period]
-                angle = [one[..., period] for one in angles]
-                motion.begin[period, part] = x
-                for step in range(_SUBSTEPS):
-                    first, middle, last = angle[2 * step : 2 * step + 3]
-                    k1 = rates(self.car, n, x, d, first)
-                    if step == 0:
-                        motion.begin_rate[period, part] = k1
-                    k2 = rates(self.car, n, x + h / 2 * k1, d, middle)
-                    k3 = rates(self.car, n, x + h / 2 * k2, d, middle)
-                    k4 = rates(self.car, n, x + h * k3, d, last)
-                    x = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+                first, middle, last = (one[..., period] for one in angles)
+                k1 = rates(self.car, n, x, d, first)
+                motion.begin[period, part], motion.begin_rate[period, part] = x, k1
+                k2 = rates(self.car, n, x + h / 2 * k1, d, middle)
+                k3 = rates(self.car, n, x + h / 2 * k2, d, middle)
+                k4 = rates(self.car, n, x + h * k3, d, last)
+                x = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
                 motion.end[period, part] = x
-                motion.end_rate[period, part] = rates(self.car, n, x, d, angle[-1])
+                motion.end_rate[period, part] = rates(self.car, n, x, d, last)
         return motion
 
     def _part(
         self, n: Numbers, base: Rows, age: Rows, span_s: AnyArray, since_s: AnyArray
     ) -> tuple[AnyArray, AnyArray, list[AnyArray]]:
-        """Of a part of all periods: its substep, drive commands (p, w, periods), and steering
-        angles at the ends and middles of the substeps. Commands are so many periods old, and have
-        begun ``since_s`` before the part."""
+        """Of a part of all periods: its length, drive commands (p, w, periods), and steering angles
+        at its beginning, middle and end. Commands are so many periods old, and have begun
+        ``since_s`` before the part."""
         flat = np.repeat(base, self._periods) + np.tile(np.arange(self._periods), len(base)) - age
         shape = len(age), len(base), self._periods
-        steps = np.linspace(0, 1, 2 * _SUBSTEPS + 1)
         behind = self._angles(n)
         angles = [
-            self._angle(n, behind, flat, since_s + one * span_s).reshape(shape) for one in steps
+            self._angle(n, behind, flat, since_s + one * span_s).reshape(shape)
+            for one in (0.0, 0.5, 1.0)
         ]
-        return span_s / _SUBSTEPS, self._u[flat, 0].reshape(shape), angles
+        return span_s, self._u[flat, 0].reshape(shape), angles
 
     def _split(self, n: Numbers) -> tuple[Rows, AnyArray]:
         """Whole periods of the delay, and what is left of it [s]."""

@@ -38,9 +38,9 @@ from bayesrace.columns import Columns, LogColumns
 from bayesrace.errors import InputError, faults_in
 from bayesrace.integrators import PREDICTION, Discretisation
 from bayesrace.learning.dataset import (
-    ROUNDING,
     Dataset,
     concatenate,
+    consecutive,
     dataset_from_arrays,
     filter_dataset,
 )  # fmt: skip
@@ -154,7 +154,7 @@ def dataset_from_columns(
     # A fault of the plant repeats the last state: no time has passed.
     pair = (now["run"] == after["run"]) & (passed_s != 0)
     following = pair & (after["seq"] == now["seq"] + 1)
-    found = following & (np.abs(passed_s - step_s) <= ROUNDING)
+    found = consecutive(states, step_s)
     if not found.any():
         if not following.any():
             raise InputError(

@@ -51,7 +51,7 @@ from bayesrace.gp.weights import (
     GpWeights,
     encode_weights,
     read_weights,
-)  # fmt: skip
+)
 from bayesrace.integrators import Discretisation
 from bayesrace.learning.dataset import Dataset, concatenate, left_out
 from bayesrace.learning.estimates import smoothed_in_turns
@@ -63,12 +63,16 @@ from bayesrace.learning.validation import identity, residual
 from bayesrace.processes import die_with_parent
 
 __all__ = ["MAX_SAMPLES", "NICE", "Outcome", "Trainer", "Training", "fit", "perform", "train"]
+
 MAX_SAMPLES: Final = 100_000
 """Choosing among more would take gigabytes."""
+
 _CONSTANT: Final = 1e-9
 """A column whose standard deviation is below this share of its size never changes."""
+
 _THINNED: Final = 3
 """One in so many samples shows where the optimum is."""
+
 _CHECKED: Final = 200
 """Samples that go with the weights, for a controller to check them by."""
 

@@ -20,7 +20,7 @@ import numpy as np
 from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
 from bayesrace.integrators import PLANT_SUBSTEP_HZ
-from bayesrace.messages import Reading
+from bayesrace.messages import MOST_READINGS, Reading
 from bayesrace.plant.vehicle import Command, Vehicle
 from bayesrace.vehicles.parameters import CarParameters
 
@@ -30,8 +30,6 @@ _log = logging.getLogger("bayesrace.plant")
 
 _AGAIN_S: Final = 0.1
 """After a report that could not be received."""
-_MOST: Final = 16
-"""Readings that one state has room for; the newest count."""
 _WINDOW_NS: Final = 5_000_000_000
 """For so long the least delay of a clock counts: clocks drift apart by up to 0.1 ms a second."""
 _RESTARTED_NS: Final = 1_000_000_000
@@ -117,7 +115,7 @@ class Hardware(Vehicle):
         self.command_s = command_s
         self._delays_s, self._silent_ns = delays_s or {}, round(silent_s * 1e9)
         self._reports: deque[tuple[Report, int]] = deque(maxlen=1000)
-        self._pending: deque[Reading] = deque(maxlen=_MOST)
+        self._pending: deque[Reading] = deque(maxlen=MOST_READINGS)  # the newest count
         self._instruments: dict[str, _Instrument] = {}
         self._poses: deque[tuple[float, ...]] = deque(maxlen=_POSES)
         self._posed_ns = -self._silent_ns
@@ -172,7 +170,7 @@ class Hardware(Vehicle):
 
     @property
     def silent(self) -> str:
-        """Why the car is to be stopped: it is not seen, or cannot be told anything; else empty."""
+        """Why the car has to stop: no pose arrives, or no command can be sent; else empty."""
         if self._fault:
             return f"no command reaches the car: {self._fault}"
         if time.monotonic_ns() - self._posed_ns <= self._silent_ns:
@@ -224,7 +222,7 @@ class Hardware(Vehicle):
         moved = (last[1:3] - first[1:3]) @ (np.cos(last[3]), np.sin(last[3]))
         self.x[3] = moved / max(last[0] - first[0], 1e-3)
 
-    # What it is told ---------------------------------------------------------------------------
+    # Commands ----------------------------------------------------------------------------------
 
     def actuate(self, u: Command) -> None:
         """A command that acts from now on, its steering rate for a period if no other comes."""

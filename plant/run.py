@@ -198,7 +198,7 @@ class Run:
                 self._lost_s = self._car.time_s
                 self.counters.holds_lost += 1
             delays, end = self._drive_period(begin_ns, begin_ns + period_ns, seq)
-            # The controller learns from a final state that nobody holds this run any more.
+            # A final state tells the controller that this run needs no director any more.
             end = self._halting(end or self._finished() or asked)
             if end is not None and end.reason == "left_world":
                 return end  # no message could carry this state

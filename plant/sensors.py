@@ -13,8 +13,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from bayesrace.messages import QUANTITIES, Reading
-from bayesrace.sensors import MOST_READINGS, Instrument, Sensors
+from bayesrace.messages import MOST_READINGS, QUANTITIES, Reading
+from bayesrace.sensors import Instrument, Sensors
 
 __all__ = ["Motion", "SensorPlayer"]
 

@@ -29,7 +29,7 @@ EXACT = (0.1, 0.0, 0.0)
 
 
 class Rolling(Hardware):
-    """A car that is seen at 100 Hz, and rolls until it is told to brake."""
+    """A car whose pose comes at 100 Hz, and that rolls until a command brakes it."""
 
     def __init__(self, pose: tuple[float, ...] = EXACT) -> None:
         super().__init__(get_car("orca"), delays_s={"pose": DELAY_S}, silent_s=0.15)

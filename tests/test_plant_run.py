@@ -269,8 +269,8 @@ def test_nothing_drives_a_car_whose_director_is_missing(planned: bool) -> None:
 
 
 def test_a_run_that_is_stopped_says_so_in_a_final_state() -> None:
-    """Else its controller would miss the director of a run that nobody holds any more; and whoever
-    stops it is there, though late."""
+    """Without it the controller would miss a director that has done its part; the one who stops the
+    run is there, though late."""
     hold = SimpleNamespace(missing=False)
 
     def answer(state: State) -> list[dict[str, Any]]:

@@ -14,10 +14,11 @@ from typing import Annotated, Final
 from msgspec import Meta, Struct
 
 __all__ = [
-    "BRAKING_ROWS", "END_REASONS", "ESTIMATED", "NOT_REPORTED", "PHASES", "QUANTITIES",
-    "SENSOR_FAULTS", "Actuation", "BrakingPlan", "CarSample", "Command", "Event", "Hold", "Message",
-    "Reading", "Reply", "RollbackRequest", "RunRequest", "Scalar", "State", "Status",
-    "StatusRequest", "StopRequest", "Telemetry", "Truth",
+    "BRAKING_ROWS", "END_REASONS", "ESTIMATED", "MOST_INSTRUMENTS", "MOST_READINGS",
+    "NOT_REPORTED", "PHASES", "QUANTITIES", "SENSOR_FAULTS", "Actuation", "BrakingPlan",
+    "CarSample", "Command", "Event", "Hold", "Message", "Reading", "Reply", "RollbackRequest",
+    "RunRequest", "Scalar", "State", "Status", "StatusRequest", "StopRequest", "Telemetry",
+    "Truth",
 ]  # fmt: skip
 
 END_REASONS: Final = (
@@ -87,6 +88,12 @@ DataMap = Annotated[
 
 QUANTITIES: Final = ("x", "y", "psi", "vx", "vy", "omega", "delta")
 """What can be measured of a car: its states."""
+
+MOST_INSTRUMENTS: Final = 8
+"""Of one car: BR_INSTRUMENTS in controller/native/bayesrace_estimator.h."""
+
+MOST_READINGS: Final = 16
+"""In one state: BR_MEASUREMENTS in controller/native/bayesrace_cycle.h."""
 
 ESTIMATED: Final = (*QUANTITIES, "gyro_offset", "steering_offset")
 """What is estimated of a car: these, then the offsets of the measured yaw rate and steering angle
@@ -164,7 +171,7 @@ class State(CarSample, frozen=True, kw_only=True, tag=3):
     estimated: bool
     """True: the state is to be estimated of ``readings``, and ``x`` says nothing; False: ``x`` is
     measured, and the readings are nothing to drive by."""
-    readings: Annotated[tuple[Reading, ...], Meta(max_length=16)]
+    readings: Annotated[tuple[Reading, ...], Meta(max_length=MOST_READINGS)]
     """What instruments have reported since the state before."""
     lockstep: bool
     """True if the plant waits for the actuation that answers this very message."""

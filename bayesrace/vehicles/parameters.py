@@ -255,9 +255,13 @@ MODELS: Final[dict[str, dict[str, type[Part]]]] = {
 unknown tyres lacks theirs."""
 
 _ORDER: Final = ("geometry", "tyres", "drive", "limits", "tracks", "learning")
+
 _TAGS: Final = frozenset(model for models in MODELS.values() for model in models)
+
 _FOLDER: Final = Path(__file__).resolve().parents[1] / "cars"
+
 _SUFFIX: Final = ".toml"
+
 _REMEDY: Final = f"'bayesrace cars {DEFAULT_CAR} --out FILE.toml' writes one to start from"
 
 

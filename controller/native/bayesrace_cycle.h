@@ -218,7 +218,7 @@ BR_API const br_estimator *br_cycle_estimator(const br_cycle *cycle);
 
 /* A state has arrived. One that is to be estimated counts with what the estimator makes of it,
  * while faulty instruments are left out and named (counters.instrument). It is doubted while
- * position or heading are not known to the car's bounds, or no instrument that is believed measures
+ * the position is not known to the car's bound, or no instrument that is believed measures
  * a position; where that was contradicted until it was unknown, until br_cycle_go, with which the
  * estimator begins anew. The car is not driven before the estimator has begun. A measured one that
  * contradicts those before it (br_state.c) counts with what the model predicts in place of what it

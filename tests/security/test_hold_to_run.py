@@ -242,7 +242,7 @@ def test_a_plant_may_demand_the_switch(tmp_path: Path, course: Course, bundles: 
         rig.drive.process.send_signal(signal.SIGINT)
         rig.drive.process.wait(30.0)
         time.sleep(NOTICED_S + LATE_S)
-        for source in ("plant", "controller"):  # whoever ends a run is not missing
+        for source in ("plant", "controller"):  # a director that ends its run is not lost
             assert rig.status(source)["holds_lost"] == 0
         plan = RunPlan(2, "test", 1, 2.0, lockstep=False)
         with pytest.raises(InputError, match="--hold-to-run"):
