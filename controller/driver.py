@@ -6,7 +6,7 @@ say otherwise, so lockstep and free-running mode are the same here.
 """
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import IntEnum, StrEnum
 from typing import Any, Final
@@ -119,7 +119,7 @@ class Driver:
         if nominal is not None:  # it knows no car yet
             nominal.set_values(MpcSettings().parameters(car, nominal.manifest.problem.name))
         self._by_weights = bool(controller.weights_version)
-        self.estimate(*self._estimator.settings(nominal=not self._by_weights))
+        self.estimate(self._estimator.settings(nominal=not self._by_weights))
         self._refused: State | None = None
         self.last_error = ""
         """Of the last step that was broken; empty if none was."""
@@ -226,14 +226,13 @@ class Driver:
             return None
         return self._refused if self._library.br_cycle_forget(self._cycle) else None
 
-    def estimate(self, start: Sequence[float], drift: Sequence[float], gate: float) -> None:
-        """How states are estimated; (nx + 2,), see br_estimation. InputError for bad numbers."""
+    def estimate(self, settings: Mapping[str, Any]) -> None:
+        """How states are estimated: a br_estimation by name. InputError for bad numbers."""
         artefact, nominal = self.controller.artefact, self.controller.nominal
-        settings = {"start": list(start), "drift": list(drift), "gate": gate}
         error = self._library.br_cycle_set_estimation(
             self._cycle,
             artefact.ffi.NULL if nominal is None else nominal.handle,
-            artefact.ffi.new("br_estimation *", settings),
+            artefact.ffi.new("br_estimation *", dict(settings)),
         )
         artefact.check(error, "estimation")
 
@@ -241,7 +240,7 @@ class Driver:
         """As much as a model with weights, or one without: from one run to the next."""
         if (by_weights := bool(self.controller.weights_version)) != self._by_weights:
             self._by_weights = by_weights
-            self.estimate(*self._estimator.settings(nominal=not by_weights))
+            self.estimate(self._estimator.settings(nominal=not by_weights))
 
     def _measurement(self, reading: Reading, known: dict[str, int]) -> Measurement | None:
         """``known``: numbers by name, to which it is added. None: of one instrument too many."""

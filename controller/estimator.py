@@ -1,6 +1,6 @@
 """From what sensors say to the state of the car: the estimator in C (bayesrace_estimator.h)."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -57,8 +57,8 @@ def read(artefact: Artefact, estimator: Any, found: Any) -> Belief | None:
 class Estimator:
     """An extended Kalman filter over the model and the weights of a step; for its thread."""
 
-    def __init__(self, step: NativeProblem, start: Floats, drift: Floats, gate: float) -> None:
-        """``start``, ``drift`` (nx + 2,), ``gate``: as in br_estimation; InputError if unusable."""
+    def __init__(self, step: NativeProblem, settings: Mapping[str, Any]) -> None:
+        """``settings``: a br_estimation by name; InputError if unusable."""
         self._artefact = artefact = step.artefact
         self._step = step  # its memory has to stay
         self._library, self._ffi, self._check = artefact.library, artefact.ffi, artefact.check
@@ -67,9 +67,8 @@ class Estimator:
         error = self._library.br_estimator_init(self._memory, size, step.handle, handle)
         self._check(error, "estimator")
         self.handle: Final = handle[0]
-        settings = {"start": list(start), "drift": list(drift), "gate": gate}
         error = self._library.br_estimator_set(
-            self.handle, self._ffi.new("br_estimation *", settings)
+            self.handle, self._ffi.new("br_estimation *", dict(settings))
         )
         self._check(error, "estimator's settings")
         self._belief = self._ffi.new("br_belief *")

@@ -364,20 +364,28 @@ class NativeProblem:
         duration_s: float,
         variance: Floats,
         begin: Floats | None = None,
-    ) -> tuple[Floats, Floats, Floats]:
-        """State (nx,) after at most a stage with u (nu,) held, its Jacobian (nx, nx) in x, and the
+        disturbance: Floats | None = None,
+    ) -> tuple[Floats, Floats, Floats, Floats]:
+        """State (nx,) after at most a stage with u (nu,) held, its Jacobians (nx, nx) in x and
+        (nx, ne) in the ``disturbance`` (ne,), a rate of change beside the residual, and the
         covariance (nx, nx) that the residual's ``variance`` (ne,) adds. ``begin`` (nx,): where the
         stage has begun, if not in x."""
         nx, problem = self._nx, self.manifest.problem
         at = self._given("begin", x if begin is None else begin, nx)
-        given = self._given("x", x, nx), at, self._given("u", u, self._nu)
-        known = self._given("variance", variance, problem.outputs)
-        made = self._made(nx), self._made(nx, nx), self._made(nx, nx)
+        outputs = problem.outputs
+        beside = np.zeros(outputs) if disturbance is None else disturbance
+        given = (
+            self._given("x", x, nx), at, self._given("u", u, self._nu), duration_s,
+            self._given("variance", variance, outputs),
+            self._given("disturbance", beside, outputs),
+        )  # fmt: skip
+        shapes = (nx,), (nx, nx), (nx, outputs), (nx, nx)
+        made = [self._made(*shape) for shape in shapes]
         results = (result for _, result in made)
-        error = self._library.br_mpc_propagate(self.handle, *given, duration_s, known, *results)
+        error = self._library.br_mpc_propagate(self.handle, *given, *results)
         self._check(error, "propagate")
-        (x_next, _), (jacobian, _), (covariance, _) = made
-        return x_next, jacobian, covariance
+        (x_next, _), (jacobian, _), (by_disturbance, _), (covariance, _) = made
+        return x_next, jacobian, by_disturbance, covariance
 
     def read_plan(self) -> tuple[Floats, Floats]:
         """The last plan, x (N + 1, nx) and u (N, nu), in buffers that the next call overwrites."""

@@ -16,7 +16,7 @@ from bayesrace.gp.weights import GpWeights
 from bayesrace.integrators import PREDICTION, Discretisation
 from bayesrace.learning.dataset import ROUNDING, Dataset, consecutive
 from bayesrace.learning.drives import Drive, Estimates
-from bayesrace.learning.smoothing import Smoothed, corrected_step, smooth, stacked
+from bayesrace.learning.smoothing import Smoothed, corrected_steps, smooth
 from bayesrace.vehicles.parameters import CarParameters
 
 __all__ = ["smoothed_again", "smoothed_in_turns", "smoothed_states"]
@@ -162,9 +162,9 @@ def _deviation(
     """Standard deviations (m, 4) of the steps from the smoothed states on, and of the angles; of
     the last state's step there is none."""
     x, u = found.x[:-1, :_NX], drive.u[found.rows[1:]]
-    h = np.full((1, len(x)), discretisation.step_s)
-    _, slope, _ = corrected_step(car, discretisation, weights)(x.T, x.T, u.T, h)
+    h = np.full(len(x), discretisation.step_s)
+    slope = corrected_steps(x, x, u, h, car, discretisation, weights).slope
     spread = np.zeros((len(found.x), 4))
-    spread[:-1, :3] = np.sqrt(found.step_variance(stacked(slope, len(x))))
+    spread[:-1, :3] = np.sqrt(found.step_variance(slope))
     spread[:, 3] = np.sqrt(found.covariance[:, 6, 6])
     return spread

@@ -28,7 +28,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import product
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import casadi as ca
 import numpy as np
@@ -43,7 +43,7 @@ from bayesrace.learning.validation import NOMINAL, predictive_sigma
 from bayesrace.vehicles.parameters import CarParameters
 from bayesrace.vehicles.parts import GRAVITY_MPS2
 
-__all__ = ["Smoothed", "corrected_step", "smooth", "stacked"]
+__all__ = ["Smoothed", "corrected_steps", "smooth"]
 
 _NX: Final = 7
 _NB: Final = 9
@@ -221,8 +221,8 @@ def smooth(
 
 def _start(first: Event, drive: Drive, car: CarParameters, around: Floats) -> tuple[Floats, Floats]:
     """Mean and covariance after the first pose."""
-    (deviation, _, _), x = car.tuning.estimator.settings(nominal=True), around.copy()
-    p = np.diag(np.square(deviation))
+    x, settings = around.copy(), car.tuning.estimator.settings(nominal=True)
+    p = np.diag(np.square(settings["start"]))
     p[3:6] *= _VAGUE**2
     x[6] = drive.steering_rad
     read = {name for one in drive.readings for name in one.values}
@@ -241,7 +241,7 @@ def _columns(events: Sequence[Event]) -> tuple[Floats, Floats]:
     return np.array([one.u for one in events]).T, np.array([[one.duration_s for one in events]])
 
 
-def stacked(matrix: Any, count: int) -> Floats:
+def _stacked(matrix: Any, count: int) -> Floats:
     """(n, m * count) of CasADi to (count, n, m)."""
     array = np.asarray(matrix, dtype=np.float64)
     return array.reshape(len(array), count, -1).transpose(1, 0, 2)
@@ -258,17 +258,17 @@ def _corrected(
     before, (u, h), e = path[:-1], _columns(events[1:]), len(events) - 1
     ends = [i if i == 0 or one.period >= 0 else 0 for i, one in enumerate(events[:-1])]
     begin = path[np.maximum.accumulate(ends), :_NX]
-    step = corrected_step(car, discretisation, weights)
-    ahead, slope, by_error = step(before[:, :_NX].T, begin.T, u, h)
-    sigma = predictive_sigma(weights, np.column_stack([begin[:, 3:], u.T]))
-    spread = stacked(by_error, e) * sigma[:, None] * np.sqrt(h.T / discretisation.step_s)[:, None]
+    step = corrected_steps(before[:, :_NX], begin, u.T, h[0], car, discretisation, weights)
+    z, period = np.unique(np.column_stack([begin[:, 3:], u.T]), axis=0, return_inverse=True)
+    sigma = predictive_sigma(weights, z)[period]
+    spread = step.by_error * sigma[:, None] * np.sqrt(h.T / discretisation.step_s)[:, None]
     f, q = np.tile(np.eye(_NB), (e, 1, 1)), np.zeros((e, _NB, _NB))
-    f[:, :_NX, :_NX] = stacked(slope, e)
+    f[:, :_NX, :_NX] = step.slope
     q[:, :_NX, :_NX] = spread @ spread.transpose(0, 2, 1)
-    drift = np.square(car.tuning.estimator.settings(nominal=False)[1])
+    drift = np.square(car.tuning.estimator.settings(nominal=False)["drift"])
     q += np.diag(drift) * h.T[..., None]
     after = before.copy()
-    after[:, :_NX] = np.asarray(ahead).T
+    after[:, :_NX] = step.ahead
 
     def go(i: int, x: Floats) -> tuple[Floats, Floats, Floats]:
         return after[i - 1] + (x - before[i - 1]) @ f[i - 1].T, f[i - 1], q[i - 1]
@@ -276,25 +276,50 @@ def _corrected(
     return go
 
 
-def corrected_step(
-    car: CarParameters, discretisation: Discretisation, weights: GpWeights | None
-) -> ca.Function:
-    """(x, begin, u, h) -> x_next, its derivatives by x (7, 7), and by the error of a step (7, 3).
+class Steps(NamedTuple):
+    """Steps of the model from n states."""
 
-    ``begin`` (7,): where the period has begun that h is a part of. Its residual counts in all its
+    ahead: Floats
+    """(n, 7)"""
+    slope: Floats
+    """(n, 7, 7), by the states."""
+    by_error: Floats
+    """(n, 7, 3), by the errors of a step."""
+
+
+def corrected_steps(
+    x: Floats,
+    begin: Floats,
+    u: Floats,
+    h: Floats,
+    car: CarParameters,
+    discretisation: Discretisation,
+    weights: GpWeights | None,
+) -> Steps:
+    """Steps from ``x`` (n, 7) under ``u`` (n, 2) within ``h`` (n,).
+
+    ``begin`` (n, 7): where the period has begun that h is a part of. Its residual counts in all its
     parts, because it is learned as that of a whole period; it moves with x.
     """
-    x, way, u, h, e = (
-        ca.MX.sym(*one) for one in (("x", 7), ("way", 7), ("u", 2), ("h", 1), ("e", 3))
-    )
-    share = h / discretisation.step_s
-    z = ca.vertcat((x - way)[3:], u)
-    mean = 0 if weights is None else share * mean_function(weights)(z)
-    ahead = discretisation.over(NOMINAL(car))(x, u, mean + e, h)
-    found = [ahead, ca.jacobian(ahead, x), ca.jacobian(ahead, e)]
-    at = ca.Function("at", [x, way, u, h, e], [ca.densify(one) for one in found])
-    begin = ca.MX.sym("begin", 7)
-    return ca.Function("step", [x, begin, u, h], list(at(x, x - begin, u, h, ca.DM.zeros(3))))
+    count, share = len(x), h / discretisation.step_s
+    mean, gradient = np.zeros((count, 3)), np.zeros((count, 3, 6))
+    if weights is not None:  # the same in all parts of a period
+        z, period = np.unique(np.column_stack([begin[:, 3:], u]), axis=0, return_inverse=True)
+        features = ca.SX.sym("z", 6)
+        found = mean_function(weights)(features)
+        at = ca.Function("gp", [features], [found, ca.densify(ca.jacobian(found, features))])
+        means, gradients = at(z.T)
+        mean = share[:, None] * np.asarray(means).T[period]
+        gradient = share[:, None, None] * _stacked(gradients, len(z))[period]
+    one, v, e = ca.SX.sym("x", 7), ca.SX.sym("u", 2), ca.SX.sym("e", 3)
+    part = ca.SX.sym("h")
+    next_x = discretisation.over(NOMINAL(car))(one, v, e, part)
+    results = [next_x, *(ca.densify(ca.jacobian(next_x, by)) for by in (one, e))]
+    step = ca.Function("step", [one, v, part, e], results)
+    ahead, by_x, by_e = step(x.T, u.T, h[None], mean.T)
+    slope, by_error = _stacked(by_x, count), _stacked(by_e, count)
+    slope[:, :, 3:] += by_error @ gradient[:, :, :4]
+    return Steps(np.asarray(ahead).T, slope, by_error)
 
 
 def _walk() -> ca.Function:
@@ -373,7 +398,7 @@ def _along(path: Floats, walk: ca.Function, u: Floats, h: Floats, density: Float
     """The random walk linearised along the path (e, 12), for densities (b, 3) of the jerk."""
     before, e = path[:-1], len(path) - 1
     ahead, slope = walk(before.T, u[:, 1:], h[:, 1:])
-    after, f = np.asarray(ahead).T, stacked(slope, e)
+    after, f = np.asarray(ahead).T, _stacked(slope, e)
     q = _jerk(h[0, 1:], before[:, 2])
 
     def go(i: int, x: Floats) -> tuple[Floats, Floats, Floats]:

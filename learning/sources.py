@@ -135,7 +135,8 @@ def dataset_from_columns(
     ``states`` has the columns :data:`STATES` to learn from, or those of the true ones to judge by.
     ``cycles`` has the columns :data:`CYCLES`. Left out are the states in whose cycles the
     fallback acted, and those that were not believed, with the states just before, which may be as
-    wrong. The input of sample k is ``u_applied`` of the state after it, which acted, not the
+    wrong; but not those that the controller was uncertain of, because smoothing says how uncertain
+    they are. The input of sample k is ``u_applied`` of the state after it, which acted, not the
     requested one. States that are to be estimated are smoothed (:mod:`~.smoothing`), and those that
     nothing was read for are left out. A missing state is counted as "gap". ``limits``: as of
     :func:`~bayesrace.learning.dataset.filter_dataset`.
@@ -177,7 +178,8 @@ def dataset_from_columns(
 
 def _left_out(states: Columns, cycles: Columns) -> Flags:
     """Which of the states are not driven by a solution, or not to be believed."""
-    fallback, doubted = cycles[cycles["fallback"] > 0], cycles[cycles["sensor_fault"] != ""]
+    fallback = cycles[cycles["fallback"] > 0]
+    doubted = cycles[~np.isin(cycles["sensor_fault"], ("", "uncertain"))]
     keys = {(run, seq) for run, seq in fallback[["run", "state_seq"]].tolist()}
     for run, seq in doubted[["run", "state_seq"]].tolist():
         keys |= {(run, seq - n) for n in range(_DOUBTFUL)}

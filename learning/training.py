@@ -124,7 +124,8 @@ def fit(
         def learn(samples: Dataset, before: GpWeights | None) -> GpWeights:
             return _fit(samples, discretisation, settings, before, 1.0, report).weights
 
-        dataset = smoothed_in_turns(dataset, discretisation, initial, learn)
+        with threadpool_limits(1, "blas"):  # threads would wait for each other
+            dataset = smoothed_in_turns(dataset, discretisation, initial, learn)
     return _fit(dataset, discretisation, settings, initial, widen, report)
 
 

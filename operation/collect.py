@@ -2,7 +2,8 @@
 
 A racing line touches the edges of the track, and a driver that is disturbed on purpose, and slides,
 leaves it there. So the drive follows the racing line where that leaves room to the edges, and else
-a line made of it; a drive that leaves the track is driven again, slower.
+a line made of it. A drive that leaves the track is driven again, slower, and so is one in which the
+fallback has to brake often, because the car was lost sight of.
 """
 
 from dataclasses import replace
@@ -32,6 +33,8 @@ __all__ = [
 _ATTEMPTS: Final = 8
 _SLOWER: Final = 0.93
 """Speed of an attempt over that of the one before; that of the last is 0.6 times the style's."""
+_FALLBACK: Final = 0.1
+"""Share of the cycles that the fallback may drive."""
 _MOST: Final = 0.3
 """Of a track's width: the most that the line keeps from each edge."""
 _LAPS: Final = 1.5
@@ -57,8 +60,8 @@ def collect(
     sensors: Sensors = EXACT,
     delay_s: float = 0.0,
 ) -> Driven:
-    """Drives for ``duration_s`` and logs the run at ``path``: the first that stays on the track, or
-    the slowest. With a ``speed_scale`` in ``settings`` there is but one.
+    """Drives for ``duration_s`` and logs the run at ``path``: the first that stays on the track and
+    is driven to its end, or the slowest. With a ``speed_scale`` in ``settings`` there is but one.
 
     ``sensors``, ``delay_s``: as in :class:`ClosedLoop`, the seed is that of ``settings``.
 
@@ -85,7 +88,8 @@ def collect(
             log.close()
         if driven.end.reason == "plant_fault":
             raise FmuFault(driven.end.text)
-        if float(track.project_path(driven.x[:, :2]).off_track_m.max()) <= 0:
+        left = float(track.project_path(driven.x[:, :2]).off_track_m.max()) > 0
+        if not left and driven.fallbacks <= _FALLBACK * len(driven.levels):
             break
     return driven
 

@@ -64,7 +64,7 @@ def data(
     """Racing line, weights and settings."""
     folder = tmp_path_factory.mktemp("data")
     values = SETTINGS.parameters(car) | ControllerSettings().cycle_values(car)
-    values |= car.tuning.estimator.named(nominal=False)
+    values |= car.tuning.estimator.settings(nominal=False)
     table = circuit.table
     export(folder, read_manifest(kinematic_artefact), table.rows, table.spacing_m, values, weights)
     return folder

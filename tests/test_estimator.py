@@ -1,8 +1,10 @@
 """The state estimator in C against a textbook filter in NumPy, and on a learned car's own lap."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -31,6 +33,11 @@ TS = 0.02
 POSE, GYRO, WHEEL, STEERING = range(4)
 START = np.array([1, 1, 3, 0.5, 0.2, 1, 0.05, 0.1, 0.02])
 DRIFT = np.array([0, 0, 0, 0.005, 0.005, 0.05, 0, 0, 0])
+MODEL = np.zeros(3)
+WALK = np.array([7, 7, 120])
+"""Standard deviations of accelerations, which are estimated in place of the model ..."""
+FADING_S = 0.2
+"""... with this time constant."""
 VARIANCE = np.array([4e-6, 9e-6, 4e-3])
 TURN, SHIFT = 0.05, 0.01
 """Offsets of yaw rate and steering angle as measured."""
@@ -53,15 +60,16 @@ class Textbook:
     x: Floats
     p: Floats
     time_s: float
+    acceleration: Floats
     squared: list[float] = field(default_factory=list)
     way: Floats = field(default_factory=lambda: np.zeros(7))
     """Since the beginning of the period, whose residual counts in all its parts."""
 
     @classmethod
-    def begun(cls, step: NativeStep, first: Measurement) -> "Textbook":
-        p = np.diag(START**2)
+    def begun(cls, step: NativeStep, first: Measurement, acceleration: Floats) -> "Textbook":
+        p = np.diag(np.r_[START, acceleration] ** 2)
         p[:3, :3] = np.diag(np.square(first.deviation))
-        return cls(step, np.r_[first.value, np.zeros(6)], p, first.time_s)
+        return cls(step, np.r_[first.value, np.zeros(9)], p, first.time_s, acceleration)
 
     def reach(self, time_s: float, u: Floats) -> None:
         if abs(np.remainder(self.time_s + TS / 2, TS) - TS / 2) < 1e-9:  # a period begins
@@ -69,9 +77,14 @@ class Textbook:
         left = time_s - self.time_s
         while left > 1e-9:
             h = min(left, TS)
-            f, q, x = np.eye(9), np.diag(DRIFT**2 * h), self.x[:7].copy()
-            after = self.step.propagate(x, u, h, VARIANCE, x - self.way)
-            self.x[:7], f[:7, :7], added = after
+            f, x, left_of = np.eye(12), self.x[:7].copy(), np.exp(-h / FADING_S)
+            q = np.diag(np.r_[h * DRIFT**2, (1 - left_of**2) * self.acceleration**2])
+            if self.acceleration.any():
+                go = partial(walked, u=u, h=h, speed=model_speed(self.step, x, u, h))
+                added, f, self.x = np.zeros((7, 7)), derivatives(go, self.x), go(self.x)
+            else:
+                after = self.step.propagate(x, u, h, VARIANCE, x - self.way)
+                self.x[:7], f[:7, :7], _, added = after
             self.way = self.way + self.x[:7] - x
             q[:7, :7] += added
             self.p = f @ self.p @ f.T + q
@@ -79,7 +92,7 @@ class Textbook:
         self.time_s = time_s
 
     def take(self, m: Measurement) -> None:
-        h = np.zeros((len(m.of), 9))
+        h = np.zeros((len(m.of), 12))
         h[range(len(m.of)), m.of] = 1
         h[:, 7] += h[:, 5]
         h[:, 8] += h[:, 6]
@@ -88,7 +101,34 @@ class Textbook:
         gain = self.p @ h.T @ np.linalg.inv(s)
         self.squared.append(float(new @ np.linalg.solve(s, new)))
         self.x = self.x + gain @ new
-        self.p = self.p - gain @ s @ gain.T
+        left = np.eye(12) - gain @ h
+        self.p = left @ self.p @ left.T + gain @ np.diag(np.square(m.deviation)) @ gain.T
+
+
+def model_speed(step: NativeStep, at: Floats, u: Floats, h: float) -> Callable[[Floats], Any]:
+    """The model's speed after h, linearised in x (7,)."""
+    ahead, slope, _, _ = step.propagate(at, u, h, VARIANCE)
+    value, gradient = ahead[3], slope[3]
+    return lambda x: value + gradient @ (x - at)
+
+
+def walked(x: Floats, u: Floats, h: float, speed: Callable[[Floats], Any]) -> Floats:
+    """x (12,) with accelerations that are held; velocities are linear in time, and the position is
+    by Simpson's rule."""
+    begin, end = x[3:6], np.r_[speed(x[:7]), x[4:6]] + h * x[9:]
+    yaw = x[2] + h * np.array([0, (3 * begin[2] + end[2]) / 8, (begin[2] + end[2]) / 2])
+    rates = [
+        (np.cos(psi) * vx - np.sin(psi) * vy, np.sin(psi) * vx + np.cos(psi) * vy)
+        for psi, (vx, vy, _) in zip(yaw, (begin, (begin + end) / 2, end), strict=True)
+    ]
+    position = x[:2] + h / 6 * (np.array([1, 4, 1]) @ rates)
+    fading = np.exp(-h / FADING_S)
+    return np.r_[position, yaw[2], end, x[6] + h * u[1], x[7:9], x[9:] * fading]
+
+
+def derivatives(f: Callable[[Floats], Floats], x: Floats) -> Floats:
+    """By complex steps, exact to rounding."""
+    return np.column_stack([f(x + 1e-30j * one).imag / 1e-30 for one in np.eye(len(x))])
 
 
 @dataclass
@@ -136,7 +176,9 @@ def estimated(estimator: Estimator, drive: Drive, late: int = 0) -> Belief:
     return estimator.read()
 
 
-def textbook(step: NativeStep, drive: Drive, late: int = 0) -> Textbook:
+def textbook(
+    step: NativeStep, drive: Drive, late: int = 0, acceleration: Floats = MODEL
+) -> Textbook:
     """What has been measured by the end of the drive."""
     last = len(drive.u) - late
     events = [
@@ -147,7 +189,7 @@ def textbook(step: NativeStep, drive: Drive, late: int = 0) -> Textbook:
     ]
     events.sort(key=lambda event: event[0])
     first = next(one for _, _, one in events if one.instrument == POSE)
-    made = Textbook.begun(step, first)
+    made = Textbook.begun(step, first, acceleration)
     for time_s, k, one in events:
         if time_s <= first.time_s:
             continue
@@ -159,8 +201,14 @@ def textbook(step: NativeStep, drive: Drive, late: int = 0) -> Textbook:
     return made
 
 
-def estimator(step: NativeStep, gate: float = 0.0) -> Estimator:
-    return Estimator(step, START, DRIFT, gate)
+def settings(**changed: Any) -> dict[str, Any]:
+    walk = {"acceleration": MODEL, "acceleration_s": FADING_S}
+    values = {"start": START, "drift": DRIFT, "gate": 0.0} | walk | changed
+    return {name: np.asarray(one).tolist() for name, one in values.items()}
+
+
+def estimator(step: NativeStep, gate: float = 0.0, acceleration: Floats = MODEL) -> Estimator:
+    return Estimator(step, settings(gate=gate, acceleration=acceleration))
 
 
 def test_the_transition_is_the_prediction_with_its_derivatives(
@@ -173,12 +221,18 @@ def test_the_transition_is_the_prediction_with_its_derivatives(
         if abs(x[6]) > car.delta_max_rad - 0.11:
             continue
         for duration_s in (0.003, TS):
-            x_next, jacobian, covariance = step.propagate(x, u, duration_s, VARIANCE)
+            x_next, jacobian, by, covariance = step.propagate(x, u, duration_s, VARIANCE)
             assert np.array_equal(x_next, step.predict(x, u, duration_s))
             for i in range(7):
                 h = 1e-6 * np.eye(7)[i]
                 ahead, back = (step.predict(x + d, u, duration_s) for d in (h, -h))
                 assert (ahead - back) / 2e-6 == pytest.approx(jacobian[:, i], abs=2e-6)
+            for i, d in enumerate(1e-3 * np.eye(3)):
+                ahead, back = (
+                    step.propagate(x, u, duration_s, VARIANCE, disturbance=one)[0]
+                    for one in (d, -d)
+                )
+                assert (ahead - back) / 2e-3 == pytest.approx(by[:, i], abs=1e-8)
         mean = np.asarray(mu(np.r_[x[3:], u])).ravel()
         spread = np.column_stack(
             [(np.array(e(x, u, mean + d)) - np.array(e(x, u, mean - d))).ravel() / 2
@@ -187,16 +241,21 @@ def test_the_transition_is_the_prediction_with_its_derivatives(
         assert spread @ spread.T == pytest.approx(covariance, rel=1e-3, abs=1e-12)
 
 
+@pytest.mark.parametrize("acceleration", [MODEL, WALK], ids=["model", "walk"])
 @pytest.mark.parametrize("late", [0, 2])
-def test_it_is_the_textbook_filter_with_all_in_order(make: Make, drive: Drive, late: int) -> None:
-    """Asynchronous instruments, offsets, and measurements that come late."""
+def test_it_is_the_textbook_filter_with_all_in_order(
+    make: Make, drive: Drive, late: int, acceleration: Floats
+) -> None:
+    """Asynchronous instruments, offsets, late measurements; with and without the model."""
     step = make()
-    made, expected = estimator(step), textbook(step, drive, late)
+    made = estimator(step, acceleration=acceleration)
+    expected = textbook(step, drive, late, acceleration)
     found = estimated(made, drive, late)
     assert found.time_s == pytest.approx(TS * len(drive.u))
-    assert found.x == pytest.approx(expected.x, rel=1e-9, abs=1e-11)
-    scale = np.sqrt(np.outer(np.diag(expected.p), np.diag(expected.p)))
-    assert np.abs((found.covariance - expected.p) / scale).max() < 1e-8
+    assert found.x == pytest.approx(expected.x[:9], rel=1e-9, abs=1e-11)
+    p = expected.p[:9, :9]
+    scale = np.sqrt(np.outer(np.diag(p), np.diag(p)))
+    assert np.abs((found.covariance - p) / scale).max() < 1e-8
     if not late:
         squared = sum(made.instrument(number).squared for number in range(4))
         assert squared == pytest.approx(sum(expected.squared), rel=1e-8)
@@ -228,7 +287,7 @@ def test_what_cannot_be_is_refused_and_counted(make: Make, drive: Drive) -> None
                 pose._replace(of=(1, 1, 2)),
             ]
         made.advance(TS * (k + 1), u, VARIANCE, [*drive.measured[k], *bad])
-    assert made.read().x == pytest.approx(expected.x, abs=1e-9)
+    assert made.read().x == pytest.approx(expected.x[:9], abs=1e-9)
     counts = made.instrument(POSE)
     assert (counts.used, counts.refused, counts.lost) == (59, 8, 24)  # it moves: two more
     assert counts.refused_in_row == 0
@@ -251,11 +310,19 @@ def test_it_begins_with_a_pose_from_standstill_and_not_before(
         made.advance(0.5, np.zeros(2), VARIANCE, [])
 
 
-@pytest.mark.parametrize("changes", [{"gate": -1.0}, {"start": -START}, {"drift": DRIFT * np.nan}])
-def test_unusable_settings_are_refused(make: Make, changes: dict[str, float]) -> None:
-    settings = {"start": START, "drift": DRIFT, "gate": 1.0} | changes
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"gate": -1.0},
+        {"start": -START},
+        {"drift": DRIFT * np.nan},
+        {"acceleration": -WALK},
+        {"acceleration": WALK, "acceleration_s": 0.0},
+    ],
+)
+def test_unusable_settings_are_refused(make: Make, changes: dict[str, Any]) -> None:
     with pytest.raises(InputError, match="estimator's settings"):
-        Estimator(make(), **settings)  # type: ignore[arg-type]
+        Estimator(make(), settings(**changes))
 
 
 def errors(

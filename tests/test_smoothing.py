@@ -82,7 +82,7 @@ def dense(
     Gaussian of the chain that the C code linearises, conditioned by its textbook formula."""
     events, path = one.events, found.path
     tuning = car.tuning.estimator
-    begin, drift, _ = tuning.settings(nominal=False)
+    begin, drift = (tuning.settings(nominal=False)[name] for name in ("start", "drift"))
     p = np.diag(np.square(begin))
     p[3:6] *= 100
     p[:3, :3], p[6, 6], p[8, 8] = np.diag(np.square(POSE)), 0, 0
@@ -98,7 +98,7 @@ def dense(
         if h > 0:
             before = path[i - 1, :7]
             variance = predictive_sigma(weights, np.r_[start[3:], event.u][None])[0] ** 2
-            ahead, f[:7, :7], q[:7, :7] = step.propagate(before, event.u, h, variance, start)
+            ahead, f[:7, :7], _, q[:7, :7] = step.propagate(before, event.u, h, variance, start)
             q += np.diag(np.square(drift)) * h
             x = np.r_[ahead, path[i - 1, 7:]] + f @ (mean[-1] - path[i - 1])
         mean.append(x)

@@ -37,6 +37,7 @@ PHASES: Final = ("idle", "running", "waiting", "ready", "driving", "fallback", "
 
 SENSOR_FAULTS: Final = (
     "", "frozen", "time", "position", "heading", "velocity", "yaw_rate", "steering", "elsewhere",
+    "uncertain",
 )  # fmt: skip
 """What can speak against a measured state, in the order of br_fault in
 controller/native/bayesrace_cycle.h, which says what each means."""

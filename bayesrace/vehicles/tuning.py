@@ -158,8 +158,8 @@ class EstimatorTuning(_Section):
     """Where a state is estimated of what instruments report (controller/native/br_estimator.c).
 
     Standard deviations before anything has been measured, around 0, and random walks beyond what
-    the model with its weights says of its own uncertainty. Where the model is not corrected, as in
-    training drives, its errors are those of the tyres.
+    the model with its weights says of its own uncertainty. Without weights, as in training drives,
+    accelerations are estimated, too.
     """
 
     position_m: float = _number(1.0, "of a coordinate [m]")
@@ -172,27 +172,29 @@ class EstimatorTuning(_Section):
     steering_offset_rad: float = _number(0.02, "of the measured steering angle's [rad]", ge=0)
     drift_mps: float = _number(0.005, "walk of the velocities in a second [m/s]")
     drift_radps: float = _number(0.05, "and of the yaw rate [rad/s]")
-    nominal_mps: float = _number(3.0, "walk of the velocities by the model without weights [m/s]")
-    nominal_radps: float = _number(40.0, "and of the yaw rate [rad/s]")
+    acceleration_mps2: float = _number(6.0, "of accelerations without weights [m/s^2]", ge=0)
+    acceleration_radps2: float = _number(120.0, "and of the yaw rate [rad/s^2]", ge=0)
+    acceleration_s: float = _number(0.2, "time in which they are forgotten [s]")
     gate: float = _number(
         1.0, "times the squared distance that one of 1,000 exceeds, a reading is refused [-]", ge=0
     )
 
-    def settings(self, *, nominal: bool) -> tuple[tuple[float, ...], tuple[float, ...], float]:
-        """start, drift and gate of br_estimation; ``nominal``: of a model without weights."""
-        walk, turn = self.drift_mps, self.drift_radps
-        if nominal:
-            walk, turn = self.nominal_mps, self.nominal_radps
-        start = (
-            self.position_m, self.position_m, self.heading_rad, self.speed_mps, self.lateral_mps,
-            self.yaw_rate_radps, self.steering_rad, self.gyro_offset_radps,
-            self.steering_offset_rad,
-        )  # fmt: skip
-        return start, (0.0, 0.0, 0.0, walk, walk, turn, 0.0, 0.0, 0.0), self.gate
-
-    def named(self, *, nominal: bool) -> dict[str, Any]:
-        """The same by name."""
-        return dict(zip(("start", "drift", "gate"), self.settings(nominal=nominal), strict=True))
+    def settings(self, *, nominal: bool) -> dict[str, Any]:
+        """Those of br_estimation, by name; ``nominal``: of a model without weights."""
+        along, about = self.acceleration_mps2, self.acceleration_radps2
+        return {
+            "start": (
+                self.position_m, self.position_m, self.heading_rad, self.speed_mps,
+                self.lateral_mps, self.yaw_rate_radps, self.steering_rad, self.gyro_offset_radps,
+                self.steering_offset_rad,
+            ),
+            "drift": (
+                0.0, 0.0, 0.0, self.drift_mps, self.drift_mps, self.drift_radps, 0.0, 0.0, 0.0,
+            ),
+            "acceleration": (along, along, about) if nominal else (0.0, 0.0, 0.0),
+            "acceleration_s": self.acceleration_s,
+            "gate": self.gate,
+        }  # fmt: skip
 
 
 class PlausibleTuning(_Section):

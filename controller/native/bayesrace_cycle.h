@@ -155,7 +155,7 @@ typedef struct {
     int64_t cost_jumps;          /* steps whose plan costs much more than to go on as before */
     int64_t stale;               /* states of the current run that were not newer than one before */
     int64_t foreign; /* states of another plant or run, or far ahead, that were not driven on */
-    int64_t faults[BR_FAULT_ELSEWHERE + 1]; /* states by what speaks against them */
+    int64_t faults[BR_FAULT_UNCERTAIN + 1]; /* states by what speaks against them */
     int fault;                              /* br_fault of the newest state */
     int doubted;    /* 1: by it the car is not driven, as it is not known well enough where it is */
     int instrument; /* whose fault it is, where that is estimated; -1: none's, or nothing is known

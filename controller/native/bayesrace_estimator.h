@@ -3,7 +3,10 @@
  * An extended Kalman filter over the controller's own corrected model (br_mpc_propagate), with the
  * weights in use. Instruments measure some of the states at a time, whenever they do, and may say
  * so late: what came after is then done over. Two offsets are estimated beside the states: of the
- * measured yaw rate (a gyro's) and of the measured steering angle.
+ * measured yaw rate (a gyro's) and of the measured steering angle. Where no weights correct the
+ * model, accelerations may be estimated as well, as first-order Markov processes (Singer,
+ * "Estimating optimal tracking filter performance for manned maneuvering targets", IEEE Trans. AES
+ * 6, 1970): beside the model's along the car, and in place of its lateral motion and yaw.
  *
  *   br_estimator_advance(estimator, time_s, u, variance, measurements, count);   each period
  *   br_estimator_read(estimator, &belief);
@@ -23,7 +26,7 @@ extern "C" {
 #endif
 
 #define BR_OFFSETS 2               /* of yaw rate and steering angle, in this order */
-#define BR_NB (BR_NX + BR_OFFSETS) /* what is estimated */
+#define BR_NB (BR_NX + BR_OFFSETS) /* what is estimated, beside accelerations */
 #define BR_INSTRUMENTS 8
 #define BR_EVENTS 64 /* of the newest periods and measurements that are kept to be done over */
 
@@ -38,7 +41,8 @@ typedef enum {
     BR_FAULT_VELOCITY,
     BR_FAULT_YAW_RATE,
     BR_FAULT_STEERING,
-    BR_FAULT_ELSEWHERE
+    BR_FAULT_ELSEWHERE,
+    BR_FAULT_UNCERTAIN
 } br_fault;
 
 /* What one instrument has measured at one moment. */
@@ -56,8 +60,11 @@ typedef struct {
     double start[BR_NB]; /* standard deviations of what has not been measured yet, around 0; an
                           * offset with 0 is none */
     double drift[BR_NB]; /* random walk beyond the model's own uncertainty [unit/sqrt(s)] */
-    double gate;         /* a measurement is refused beyond so many times the squared distance that
-                          * one of 1,000 exceeds (chi-squared); 0: none is */
+    double acceleration[BR_NE]; /* standard deviations of these accelerations, around 0; all 0: the
+                                 * model alone moves the car */
+    double acceleration_s;      /* their time constant; above 0, unless there are none */
+    double gate; /* a measurement is refused beyond so many times the squared distance that one of
+                  * 1,000 exceeds (chi-squared); 0: none is */
 } br_estimation;
 
 /* State with its covariance. */

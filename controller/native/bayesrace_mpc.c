@@ -195,11 +195,13 @@ br_mpc_error br_mpc_set_covariance(br_mpc *mpc, const double covariance[BR_NX * 
 
 br_mpc_error br_mpc_propagate(const br_mpc *mpc, const double x[BR_NX], const double begin[BR_NX],
                               const double u[BR_NU], double duration_s,
-                              const double variance[BR_NE], double x_next[BR_NX],
-                              double jacobian[BR_NX * BR_NX], double covariance[BR_NX * BR_NX]) {
+                              const double variance[BR_NE], const double disturbance[BR_NE],
+                              double x_next[BR_NX], double jacobian[BR_NX * BR_NX],
+                              double by_disturbance[BR_NX * BR_NE],
+                              double covariance[BR_NX * BR_NX]) {
     if (!mpc) return BR_ERROR_NULL;
-    return mpc->code->propagate(mpc, x, begin, u, duration_s, variance, x_next, jacobian,
-                                covariance);
+    return mpc->code->propagate(mpc, x, begin, u, duration_s, variance, disturbance, x_next,
+                                jacobian, by_disturbance, covariance);
 }
 
 #if BR_HAS_PATH

@@ -305,15 +305,18 @@ BR_API br_mpc_error br_mpc_prepare(br_mpc *mpc, double elapsed_s, double budget_
 BR_API br_mpc_error br_mpc_predict(const br_mpc *mpc, const double x[BR_NX], const double u[BR_NU],
                                    double duration_s, double x_next[BR_NX]);
 
-/* The same over at most a stage (BR_TS), with what an estimator needs: how x_next changes with x
- * while no limit is reached, row by row, and the covariance that the residual's variance (per
- * stage; NULL: 0) adds, whose errors are taken to be independent from one stage to the next.
- * begin: the state at which the stage has begun, whose residual counts in all its parts, because it
- * is learned as that of a whole stage; NULL: x. */
+/* The same over at most a stage (BR_TS), with what an estimator needs: how x_next changes while no
+ * limit is reached, row by row, with x and with the disturbance, and the covariance that the
+ * residual's variance (per stage; NULL: 0) adds, whose errors are taken to be independent from one
+ * stage to the next. begin: the state at which the stage has begun, whose residual counts in all
+ * its parts, because it is learned as that of a whole stage; NULL: x. disturbance: a rate of change
+ * beside the residual [unit/s]; NULL: 0. */
 BR_API br_mpc_error br_mpc_propagate(const br_mpc *mpc, const double x[BR_NX],
                                      const double begin[BR_NX], const double u[BR_NU],
                                      double duration_s, const double variance[BR_NE],
-                                     double x_next[BR_NX], double jacobian[BR_NX * BR_NX],
+                                     const double disturbance[BR_NE], double x_next[BR_NX],
+                                     double jacobian[BR_NX * BR_NX],
+                                     double by_disturbance[BR_NX * BR_NE],
                                      double covariance[BR_NX * BR_NX]);
 
 #if BR_HAS_PATH

@@ -198,7 +198,7 @@ static br_fault doubtful(br_cycle *cycle, const br_estimate *now) {
     const int unknown = spread > most_m * most_m;
     const double since_s = cycle->stream.newest.time_s - cycle->monitor.trusted_s;
     cycle->estimator.latched |= contradicted && (unknown || since_s > RECOVER_S);
-    return !found && unknown ? BR_FAULT_POSITION : found;
+    return !found && unknown ? BR_FAULT_UNCERTAIN : found;
 }
 
 /* What speaks against the newest state, or against an instrument. */

@@ -21,6 +21,10 @@
 #define APART_S 0.2    /* between two poses whose difference is a velocity */
 #define STEERED 4.0    /* so many times the steering angle's deviation has a car that moves */
 
+/* The states that the residuals correct. */
+static const int RATE[] = {BR_INDEX_VX, BR_INDEX_VY, BR_INDEX_OMEGA};
+_Static_assert(sizeof RATE / sizeof RATE[0] == BR_NE, "a state for each residual");
+
 /* Chi-squared that one of 1,000 exceeds, by degrees of freedom from 1 on. */
 static const double EXCEEDED[] = {10.828, 13.816, 16.266, 18.467, 20.515, 22.458, 24.322};
 _Static_assert(sizeof EXCEEDED / sizeof EXCEEDED[0] >= BR_NX, "a bound for each number of values");
@@ -45,8 +49,15 @@ br_mpc_error br_estimator_set(br_estimator *estimator, const br_estimation *sett
     for (int i = 0; i < BR_NB; ++i)
         valid &= isfinite(settings->start[i]) && settings->start[i] >= 0 &&
                  isfinite(settings->drift[i]) && settings->drift[i] >= 0;
+    int walks = 0;
+    for (int j = 0; j < BR_NE; ++j) {
+        valid &= isfinite(settings->acceleration[j]) && settings->acceleration[j] >= 0;
+        walks |= settings->acceleration[j] > 0;
+    }
+    if (walks) valid &= isfinite(settings->acceleration_s) && settings->acceleration_s > 0;
     if (!valid) return BR_ERROR_PARAMETERS;
     estimator->settings = *settings;
+    estimator->walks = walks;
     estimator->has_settings = 1;
     br_estimator_reset(estimator);
     return BR_OK;
@@ -60,36 +71,87 @@ void br_estimator_reset(br_estimator *estimator) {
 
 /* --- between two events --- */
 
+/* P <- F P F' + Q, where what is beside the states stays. */
+static void spread(const double jacobian[BR_NX * BR_NX],
+                   const double by_acceleration[BR_NX * BR_NE], const double q[BR_NX * BR_NX],
+                   br_estimate *b) {
+    double f[BR_NX][BR_NA] = {{0}}, fp[BR_NX][BR_NA];
+    const int n = b->count;
+    for (int i = 0; i < BR_NX; ++i) {
+        for (int l = 0; l < BR_NX; ++l) f[i][l] = jacobian[BR_NX * i + l];
+        for (int j = 0; j < n - BR_NB; ++j) f[i][BR_NB + j] = by_acceleration[BR_NE * i + j];
+        for (int j = 0; j < n; ++j) {
+            fp[i][j] = 0;
+            for (int l = 0; l < BR_NX; ++l) fp[i][j] += f[i][l] * b->p[l][j];
+            for (int l = BR_NB; l < n; ++l) fp[i][j] += f[i][l] * b->p[l][j];
+        }
+    }
+    for (int i = 0; i < BR_NX; ++i) {
+        for (int j = i; j < BR_NX; ++j) {
+            double sum = q[BR_NX * i + j];
+            for (int l = 0; l < BR_NX; ++l) sum += fp[i][l] * f[j][l];
+            for (int l = BR_NB; l < n; ++l) sum += fp[i][l] * f[j][l];
+            b->p[i][j] = b->p[j][i] = sum;
+        }
+        for (int j = BR_NX; j < n; ++j) b->p[i][j] = b->p[j][i] = fp[i][j];
+    }
+}
+
+/* As br_mpc_propagate, where accelerations move the car: along it beside the model, which knows the
+ * motor, else in its place, because by the model a wheel that is turned moves the car at once. */
+static br_mpc_error walk(const br_mpc *mpc, const br_estimate *b, const double u[BR_NU],
+                         double duration, double next[BR_NX], double f[BR_NX * BR_NX],
+                         double by[BR_NX * BR_NE], double q[BR_NX * BR_NX]) {
+    double lacking[BR_NE];
+    const double *x = b->x, *acceleration = b->x + BR_NB;
+    br_mpc_error error = br_mpc_propagate(mpc, x, x, u, duration, NULL, NULL, next, f, by, q);
+    for (int j = 0; j < BR_NE; ++j) {
+        lacking[j] = acceleration[j];
+        if (RATE[j] != BR_INDEX_VX) lacking[j] += (x[RATE[j]] - next[RATE[j]]) / duration;
+    }
+    if (!error) error = br_mpc_propagate(mpc, x, x, u, duration, NULL, lacking, next, f, by, q);
+    if (error) return error;
+    double changed[BR_NE][BR_NX] = {{0}}; /* of what is lacking, with x */
+    for (int j = 0; j < BR_NE; ++j)
+        for (int l = 0; RATE[j] != BR_INDEX_VX && l < BR_NX; ++l)
+            changed[j][l] = ((l == RATE[j]) - f[BR_NX * RATE[j] + l]) / duration;
+    for (int i = 0; i < BR_NX; ++i)
+        for (int l = 0; l < BR_NX; ++l)
+            for (int j = 0; j < BR_NE; ++j) f[BR_NX * i + l] += by[BR_NE * i + j] * changed[j][l];
+    return BR_OK;
+}
+
+/* Accelerations after a duration: less of what they were, and something new. */
+static void fade(const br_estimation *settings, double duration, br_estimate *b) {
+    const double left = exp(-duration / settings->acceleration_s);
+    for (int i = BR_NB; i < BR_NA; ++i) {
+        const double deviation = settings->acceleration[i - BR_NB];
+        b->x[i] *= left;
+        for (int l = 0; l < BR_NA; ++l) b->p[i][l] = b->p[l][i] = left * b->p[i][l];
+        b->p[i][i] = left * b->p[i][i] + (1 - left * left) * deviation * deviation;
+    }
+}
+
 /* x and P after a duration of at most a stage, under u. The residual is that of where the period
  * began, by what is believed now: taken anew at each measurement it would run ahead of the car. */
 static br_mpc_error propagate(const br_estimator *estimator, const double u[BR_NU],
                               const double variance[BR_NE], double duration, br_estimate *b) {
-    double f[BR_NX * BR_NX], q[BR_NX * BR_NX], fp[BR_NX][BR_NB], begin[BR_NX], next[BR_NX];
+    double f[BR_NX * BR_NX], by[BR_NX * BR_NE], q[BR_NX * BR_NX], begin[BR_NX], next[BR_NX];
     for (int i = 0; i < BR_NX; ++i) begin[i] = b->x[i] - b->way[i];
-    const br_mpc_error error =
-        br_mpc_propagate(estimator->mpc, b->x, begin, u, duration, variance, next, f, q);
+    const br_mpc_error error = estimator->walks
+                                   ? walk(estimator->mpc, b, u, duration, next, f, by, q)
+                                   : br_mpc_propagate(estimator->mpc, b->x, begin, u, duration,
+                                                      variance, NULL, next, f, by, q);
     if (error) return error;
     for (int i = 0; i < BR_NX; ++i) {
         b->way[i] += next[i] - b->x[i];
         b->x[i] = next[i];
     }
-    for (int i = 0; i < BR_NX; ++i)
-        for (int j = 0; j < BR_NB; ++j) {
-            fp[i][j] = 0;
-            for (int l = 0; l < BR_NX; ++l) fp[i][j] += f[BR_NX * i + l] * b->p[l][j];
-        }
-    for (int i = 0; i < BR_NX; ++i) {
-        for (int j = i; j < BR_NX; ++j) {
-            double sum = q[BR_NX * i + j];
-            for (int l = 0; l < BR_NX; ++l) sum += fp[i][l] * f[BR_NX * j + l];
-            b->p[i][j] = b->p[j][i] = sum;
-        }
-        for (int j = BR_NX; j < BR_NB; ++j) b->p[i][j] = b->p[j][i] = fp[i][j];
-    }
-    for (int i = 0; i < BR_NB; ++i) {
-        const double drift = estimator->settings.drift[i];
-        if (i < BR_NX || estimator->settings.start[i] > 0) b->p[i][i] += duration * drift * drift;
-    }
+    spread(f, by, q, b);
+    const br_estimation *s = &estimator->settings;
+    for (int i = 0; i < BR_NB; ++i)
+        if (i < BR_NX || s->start[i] > 0) b->p[i][i] += duration * s->drift[i] * s->drift[i];
+    if (estimator->walks) fade(s, duration, b);
     return BR_OK;
 }
 
@@ -112,7 +174,7 @@ static int offset_in(int state) {
 }
 
 /* Column of P H', or row of H P. */
-double br_estimate_observed(const double row[BR_NB], int state) {
+double br_estimate_observed(const double row[BR_NA], int state) {
     const int offset = offset_in(state);
     return row[state] + (offset < 0 ? 0 : row[offset]);
 }
@@ -143,16 +205,16 @@ static void solve(int n, double s[BR_NX][BR_NX], double v[BR_NX]) {
 }
 
 /* P <- (I - K H) P (I - K H)' + K R K' */
-static void update(const br_measurement *m, double hp[BR_NX][BR_NB], double k[BR_NB][BR_NX],
+static void update(const br_measurement *m, double hp[BR_NX][BR_NA], double k[BR_NA][BR_NX],
                    br_estimate *b) {
-    double left[BR_NB][BR_NB];
-    for (int i = 0; i < BR_NB; ++i)
-        for (int j = 0; j < BR_NB; ++j) {
+    double left[BR_NA][BR_NA];
+    for (int i = 0; i < b->count; ++i)
+        for (int j = 0; j < b->count; ++j) {
             left[i][j] = b->p[i][j];
             for (int a = 0; a < m->count; ++a) left[i][j] -= k[i][a] * hp[a][j];
         }
-    for (int i = 0; i < BR_NB; ++i)
-        for (int j = i; j < BR_NB; ++j) {
+    for (int i = 0; i < b->count; ++i)
+        for (int j = i; j < b->count; ++j) {
             double sum = left[i][j];
             for (int a = 0; a < m->count; ++a)
                 sum += k[j][a] * (m->deviation[a] * m->deviation[a] * k[i][a] -
@@ -165,13 +227,13 @@ static void update(const br_measurement *m, double hp[BR_NX][BR_NB], double k[BR
  * that. -1: refused, and nothing changes. */
 static double take(double gate, const br_measurement *m, br_estimate *b) {
     const int n = m->count;
-    double hp[BR_NX][BR_NB], s[BR_NX][BR_NX], k[BR_NB][BR_NX];
+    double hp[BR_NX][BR_NA], s[BR_NX][BR_NX], k[BR_NA][BR_NX];
     double difference[BR_NX], weighted[BR_NX], squared = 0;
     for (int a = 0; a < n; ++a) {
         difference[a] = m->value[a] - br_estimate_observed(b->x, m->of[a]);
         if (m->of[a] == BR_INDEX_PSI) difference[a] = remainder(difference[a], 2 * M_PI);
         weighted[a] = difference[a];
-        for (int i = 0; i < BR_NB; ++i) hp[a][i] = br_estimate_observed(b->p[i], m->of[a]);
+        for (int i = 0; i < b->count; ++i) hp[a][i] = br_estimate_observed(b->p[i], m->of[a]);
     }
     for (int a = 0; a < n; ++a) {
         for (int c = 0; c < n; ++c) s[a][c] = br_estimate_observed(hp[a], m->of[c]);
@@ -181,7 +243,7 @@ static double take(double gate, const br_measurement *m, br_estimate *b) {
     solve(n, s, weighted);
     for (int a = 0; a < n; ++a) squared += difference[a] * weighted[a];
     if (!(squared >= 0) || (gate > 0 && squared > gate * EXCEEDED[n - 1])) return -1;
-    for (int i = 0; i < BR_NB; ++i) {
+    for (int i = 0; i < b->count; ++i) {
         for (int a = 0; a < n; ++a) {
             b->x[i] += hp[a][i] * weighted[a];
             k[i][a] = hp[a][i];
@@ -267,23 +329,43 @@ static void begin_moving(const br_measurement *before, const br_measurement *m, 
     b->x[BR_INDEX_OMEGA] = dpsi / dt;
     b->x[BR_INDEX_DELTA] =
         atan2(BR_WHEELBASE_M * b->x[BR_INDEX_OMEGA], fmax(b->x[BR_INDEX_VX], BR_WHEELBASE_M / dt));
-    for (int i = 0; i < BR_NX; ++i) {
-        const int rate = i == BR_INDEX_VX || i == BR_INDEX_VY || i == BR_INDEX_OMEGA;
-        if (rate) b->p[i][i] += noise / (dt * dt);
-    }
+    for (int j = 0; j < BR_NE; ++j) b->p[RATE[j]][RATE[j]] += noise / (dt * dt);
     b->p[BR_INDEX_DELTA][BR_INDEX_DELTA] *= STEERED * STEERED;
+}
+
+/* Where no model relates it to what is measured, the steering angle is still what it was. */
+static void keep_steering(const br_estimate *known, br_estimate *b) {
+    const int of[] = {BR_INDEX_DELTA, BR_NX + 1}; /* with the offset of what measures it */
+    for (int i = 0; i < 2; ++i) {
+        b->x[of[i]] = known->x[of[i]];
+        for (int j = 0; j < 2; ++j) b->p[of[i]][of[j]] = known->p[of[i]][of[j]];
+    }
+}
+
+/* What was believed when this was measured; NULL: nothing. */
+static const br_estimate *believed_at(br_estimator *estimator, double time_s) {
+    int k = estimator->count - 1;
+    while (k >= 0 && br_estimator_event(estimator, k)->time_s > time_s + SAME_S) --k;
+    return k < 0 ? NULL : &br_estimator_event(estimator, k)->after;
 }
 
 /* before: another pose, shortly before; NULL: none. */
 static void begin(br_estimator *estimator, const br_measurement *m, const br_measurement *before) {
     br_event first = {.time_s = m->time_s};
     br_estimate *b = &first.after;
+    const br_estimate *known = believed_at(estimator, m->time_s);
+    const br_estimate kept = known ? *known : *b;
     br_estimator_reset(estimator); /* never of one that is latched */
     estimator->agreed = estimator->astray = 0;
     estimator->posed_s = m->time_s;
-    for (int i = 0; i < BR_NB; ++i)
-        b->p[i][i] = estimator->settings.start[i] * estimator->settings.start[i];
+    b->count = estimator->walks ? BR_NA : BR_NB;
+    for (int i = 0; i < b->count; ++i) {
+        const br_estimation *s = &estimator->settings;
+        const double deviation = i < BR_NB ? s->start[i] : s->acceleration[i - BR_NB];
+        b->p[i][i] = deviation * deviation;
+    }
     if (before) begin_moving(before, m, b);
+    if (known && estimator->walks) keep_steering(&kept, b);
     for (int a = 0; a < m->count; ++a) {
         const int i = m->of[a];
         b->x[i] = m->value[a];
@@ -372,8 +454,8 @@ static double widen(const br_estimator *estimator, const br_event *one) {
 
 /* The covariance, but for the offsets: these belong to the sensors. */
 static void grow(double by, br_estimate *b) {
-    for (int i = 0; i < BR_NB; ++i)
-        for (int j = 0; j < BR_NB; ++j)
+    for (int i = 0; i < b->count; ++i)
+        for (int j = 0; j < b->count; ++j)
             b->p[i][j] *= (i < BR_NX ? sqrt(by) : 1) * (j < BR_NX ? sqrt(by) : 1);
 }
 
@@ -508,7 +590,8 @@ br_mpc_error br_estimator_read(const br_estimator *estimator, br_belief *out) {
     const br_event *last = &estimator->events[estimator->order[estimator->count - 1]];
     out->time_s = last->time_s;
     memcpy(out->x, last->after.x, sizeof out->x);
-    memcpy(out->covariance, last->after.p, sizeof out->covariance);
+    for (int i = 0; i < BR_NB; ++i)
+        memcpy(out->covariance + BR_NB * i, last->after.p[i], BR_NB * sizeof(double));
     memcpy(out->corrected, estimator->corrected, sizeof out->corrected);
     return BR_OK;
 }

@@ -4,8 +4,11 @@
 
 #include "bayesrace_estimator.h"
 
+#define BR_NA (BR_NB + BR_NE) /* with accelerations */
+
 typedef struct {
-    double x[BR_NB], p[BR_NB][BR_NB];
+    int count; /* of these: BR_NA, or BR_NB without accelerations */
+    double x[BR_NA], p[BR_NA][BR_NA];
     double way[BR_NX]; /* how far x has moved since the beginning of its period */
 } br_estimate;
 
@@ -21,8 +24,8 @@ typedef struct {
 struct br_estimator {
     const br_mpc *mpc;
     br_estimation settings;
-    int has_settings;
-    int count; /* of events, the oldest first; 0: it has not begun */
+    int has_settings, walks; /* walks: by accelerations in place of the model */
+    int count;               /* of events, the oldest first; 0: it has not begun */
     int order[BR_EVENTS];
     br_event events[BR_EVENTS];
     double corrected[BR_NX]; /* see br_belief */
@@ -43,7 +46,7 @@ static inline const br_estimate *br_estimator_now(br_estimator *estimator) {
 }
 
 /* What is expected of a measured state, its offset included. */
-double br_estimate_observed(const double x[BR_NB], int state);
+double br_estimate_observed(const double x[BR_NA], int state);
 
 /* x and P after a duration, under u. */
 br_mpc_error br_estimator_reach(const br_estimator *estimator, const double u[BR_NU],

@@ -210,9 +210,10 @@ br_mpc_error br_predict_by(const br_mpc *mpc, const br_gp *gp, const double x[BR
 
 br_mpc_error br_propagate(const br_mpc *mpc, const double x[BR_NX], const double begin[BR_NX],
                           const double u[BR_NU], double duration_s, const double variance[BR_NE],
-                          double x_next[BR_NX], double jacobian[BR_NX * BR_NX],
+                          const double disturbance[BR_NE], double x_next[BR_NX],
+                          double jacobian[BR_NX * BR_NX], double by_disturbance[BR_NX * BR_NE],
                           double covariance[BR_NX * BR_NX]) {
-    if (!x || !u || !x_next || !jacobian || !covariance) return BR_ERROR_NULL;
+    if (!x || !u || !x_next || !jacobian || !by_disturbance || !covariance) return BR_ERROR_NULL;
     if (!mpc->has_parameters) return BR_ERROR_NOT_READY;
     if (!(duration_s > 0 && duration_s <= BR_TS * (1 + PART_MIN))) return BR_ERROR_TIME;
     if (!br_plausible_state(x) || !br_all_finite(u, BR_NU)) return BR_ERROR_STATE;
@@ -225,7 +226,8 @@ br_mpc_error br_propagate(const br_mpc *mpc, const double x[BR_NX], const double
     BR_CALL(br_acting, BR_LIST(x, u, &duration_s, theta), BR_LIST(acting));
     br_stage_features(begin ? begin : x, acting, z[0]);
     if (gp->any) br_gp_evaluate(gp, 1, z, kernels, 1, &residual);
-    for (int j = 0; j < BR_NE; ++j) mean[j] = share * residual.mean[j];
+    for (int j = 0; j < BR_NE; ++j)
+        mean[j] = share * residual.mean[j] + duration_s * (disturbance ? disturbance[j] : 0);
     BR_CALL(br_transit, BR_LIST(x, acting, mean, &duration_s), BR_LIST(unlimited, in_w[0]));
     for (int i = 0; i < BR_NX; ++i)
         for (int l = 0; l < BR_NX; ++l) {
@@ -235,6 +237,9 @@ br_mpc_error br_propagate(const br_mpc *mpc, const double x[BR_NX], const double
             covariance[BR_NX * i + l] = added;
             jacobian[BR_NX * i + l] = in_w[i][l];
         }
+    for (int i = 0; i < BR_NX; ++i)
+        for (int j = 0; j < BR_NE; ++j)
+            by_disturbance[BR_NE * i + j] = duration_s * in_w[i][BR_NX + j];
     for (int a = 0; a < BR_NZ; ++a)
         for (int j = 0; BR_FEATURE[a] < BR_NX && j < BR_NE; ++j)
             for (int i = 0; i < BR_NX; ++i)

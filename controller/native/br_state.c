@@ -309,6 +309,7 @@ const char *br_cycle_fault_text(br_fault fault) {
         [BR_FAULT_STEERING] = "the steering angle does not follow from the steering rate",
         [BR_FAULT_ELSEWHERE] =
             "the states agree with each other again, but not with where the car must be",
+        [BR_FAULT_UNCERTAIN] = "too little has been measured to know where the car is",
     };
     return (unsigned)fault < sizeof texts / sizeof texts[0] ? texts[fault] : "unknown fault";
 }

@@ -212,12 +212,14 @@ int br_files_settings(const char *folder, br_mpc_parameters *parameters, br_driv
 #define COUNT_OF_PARAMETERS(field) {.name = #field, .whole = &p->field},
 #define OF_DRIVING(field) {.name = #field, .number = &d->field},
 #define COUNT_OF_DRIVING(field) {.name = #field, .whole = &d->field},
-    setting settings[] = {BR_PARAMETERS(OF_PARAMETERS)
-                              BR_SOLVER_FIELDS(OF_PARAMETERS, COUNT_OF_PARAMETERS)
-                                  BR_DRIVING_FIELDS(OF_DRIVING, COUNT_OF_DRIVING){
-                                      .name = "start", .number = estimation->start, .count = BR_NB},
-                          {.name = "drift", .number = estimation->drift, .count = BR_NB},
-                          {.name = "gate", .number = &estimation->gate}};
+    setting settings[] = {
+        BR_PARAMETERS(OF_PARAMETERS) BR_SOLVER_FIELDS(OF_PARAMETERS, COUNT_OF_PARAMETERS)
+            BR_DRIVING_FIELDS(OF_DRIVING, COUNT_OF_DRIVING){
+                .name = "start", .number = estimation->start, .count = BR_NB},
+        {.name = "drift", .number = estimation->drift, .count = BR_NB},
+        {.name = "acceleration", .number = estimation->acceleration, .count = BR_NE},
+        {.name = "acceleration_s", .number = &estimation->acceleration_s},
+        {.name = "gate", .number = &estimation->gate}};
     const int count = sizeof settings / sizeof settings[0];
     FILE *file = opened(folder, r.name);
     if (!file) return wrong(&r, "is missing or cannot be read", ANEW);
