@@ -123,7 +123,8 @@ def walked(x: Floats, u: Floats, h: float, speed: Callable[[Floats], Any]) -> Fl
     ]
     position = x[:2] + h / 6 * (np.array([1, 4, 1]) @ rates)
     fading = np.exp(-h / FADING_S)
-    return np.r_[position, yaw[2], end, x[6] + h * u[1], x[7:9], x[9:] * fading]
+    after: Floats = np.r_[position, yaw[2], end, x[6] + h * u[1], x[7:9], x[9:] * fading]
+    return after
 
 
 def derivatives(f: Callable[[Floats], Floats], x: Floats) -> Floats:
