@@ -311,6 +311,21 @@ def test_it_begins_with_a_pose_from_standstill_and_not_before(
         made.advance(0.5, np.zeros(2), VARIANCE, [])
 
 
+def test_steering_stays_what_it_was_where_it_begins_anew_without_the_model(
+    kinematic_artefact: Path, car: CarParameters
+) -> None:
+    """Nothing that is measured says where the wheels are; the first of two poses is an outlier."""
+    step = NativeStep(kinematic_artefact, car, SETTINGS)
+    made, u = estimator(step, gate=1.0, acceleration=WALK), np.array([0.0, 1.0])
+    for k in range(1, 8):
+        pose = (2.0 * TS * k, 0.0, 0.0) if k != 2 else (0.5, 0.3, 0.4)
+        made.advance(TS * k, u, VARIANCE, [of_pose(TS * k, np.array(pose))])
+    found, turned = made.read(), 6 * TS
+    assert found.x[3] == pytest.approx(2.0, abs=0.3)  # it has begun anew, and moves
+    assert found.x[6] == pytest.approx(turned, abs=1e-12)
+    assert found.covariance[6, 6] == pytest.approx(START[6] ** 2)
+
+
 @pytest.mark.parametrize(
     "changes",
     [

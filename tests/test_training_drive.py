@@ -3,8 +3,10 @@
 import io
 import json
 import shutil
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,6 +17,7 @@ from bayesrace.codegen.build import build
 from bayesrace.codegen.settings import BuildSettings
 from bayesrace.controller import pure_pursuit
 from bayesrace.controller.pure_pursuit import DrivingStyle, PurePursuitSettings
+from bayesrace.log import LogReader
 from bayesrace.operation.closed_loop import Driven, built_in_car
 from bayesrace.operation.collect import collect, drive_length_s, training_line, training_margin_m
 from bayesrace.operation.report import write_report
@@ -80,6 +83,22 @@ def test_a_drive_that_leaves_the_track_is_driven_again_slower(
     kept, once = (collect(*course, one, vehicle=built_in_car(CAR)) for one in settings)
     assert off_track_m(kept).max() <= 0
     assert off_track_m(once).max() > 0, "a scale that is asked for is driven once"
+
+
+def test_a_drive_in_which_the_car_is_lost_sight_of_is_driven_again_slower(
+    driven: dict[DrivingStyle, tuple[Driven, Path]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole, _ = driven["calm"]
+    blind = replace(whole, levels=np.where(np.arange(len(whole.levels)) > 500, 3, 0))
+    drives, log = [blind, whole], tmp_path / "drive.mcap"
+    monkeypatch.setattr(
+        "bayesrace.operation.collect.ClosedLoop",
+        lambda *_, **__: SimpleNamespace(drive=lambda *_, **__: drives.pop(0)),
+    )
+    monkeypatch.setattr("bayesrace.operation.collect.PythonController", lambda *_: None)
+    assert collect(TRACK, at_the_edge(), CAR, tmp_path, log, 12.0, PurePursuitSettings()) is whole
+    scale = float(LogReader(log).metadata()["collect"]["speed_scale"])
+    assert scale == pytest.approx(pure_pursuit._SCALES["limit"] * 0.93, abs=6e-3)
 
 
 def test_a_line_with_room_is_followed_as_it_is() -> None:
