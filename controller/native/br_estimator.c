@@ -377,6 +377,7 @@ static void begin(br_estimator *estimator, const br_measurement *m, const br_mea
         }
     }
     estimator->instrument[m->instrument].used += 1;
+    estimator->instrument[m->instrument].used_s = m->time_s;
     insert(estimator, 0, &first);
 }
 
@@ -417,7 +418,7 @@ static int count(br_estimator *estimator, const br_event *one, double squared) {
     br_instrument *instrument = &estimator->instrument[m->instrument];
     if (squared < 0) {
         instrument->refused += 1;
-        instrument->refused_in_row += 1;
+        if (!instrument->refused_in_row++) instrument->refused_s = m->time_s;
         if (estimator->agreed)
             br_instrument_bad(instrument, br_instrument_kind(m, &one->after));
         else
@@ -430,6 +431,7 @@ static int count(br_estimator *estimator, const br_event *one, double squared) {
         return 0;
     }
     instrument->used += 1;
+    instrument->used_s = fmax(m->time_s, instrument->used_s);
     instrument->squared += squared;
     instrument->expected += m->count;
     if (!of_pose(m)) return 1;
@@ -444,9 +446,10 @@ static int count(br_estimator *estimator, const br_event *one, double squared) {
 static double widen(const br_estimator *estimator, const br_event *one) {
     const br_measurement *m = &one->measured;
     const double gate = estimator->settings.gate;
-    if (!(gate > 0) || !estimator->agreed || !br_instrument_near(m, &one->after)) return 1;
+    const br_instrument *instrument = &estimator->instrument[m->instrument];
     int contradicted;
-    if (!estimator->instrument[m->instrument].refused_in_row) return 1;
+    if (!(gate > 0) || !estimator->agreed || !instrument->refused_in_row) return 1;
+    if (!br_instrument_near(instrument, m, &one->after)) return 1;
     if (br_estimator_blind(estimator, &contradicted)) return 1;
     br_estimate alone = one->after;
     return fmin(fmax(take(INFINITY, m, &alone) / m->count, 1), WIDEST);

@@ -61,9 +61,11 @@ void br_instrument_arrive(br_instrument *instrument, const br_measurement *m, do
 int br_instrument_holds(const br_instrument *instrument, const br_measurement *m);
 int br_instrument_repeats(br_instrument *instrument, const br_measurement *m, const br_estimate *b);
 
-/* Whether it differs from what is expected by so little that the model may be wrong; or by less
- * than any model errs in position, whatever it says of itself. */
-int br_instrument_near(const br_measurement *m, const br_estimate *b);
+/* Whether it differs from what is expected by so little that the model may be wrong, which has had
+ * no measurement of the instrument's until these were refused; or by less than any model errs in
+ * position, whatever it says of itself. */
+int br_instrument_near(const br_instrument *instrument, const br_measurement *m,
+                       const br_estimate *b);
 int br_instrument_possible(const br_measurement *m, const br_estimate *b);
 
 /* What in the measurement is farthest from what is expected. */

@@ -18,6 +18,8 @@
 #define MOVED 4.0      /* standard deviations by which what is measured has changed for certain */
 #define INTERVALS 5.0  /* of silence, ... */
 #define SILENT_S 0.15  /* ... and at least so long: motion capture has gaps of 100 ms */
+#define USUAL 2.0      /* intervals between two that are used, one of which may be lost or wrong */
+#define ERRING 0.25    /* share of the largest accelerations that a model's may be wrong by */
 #define NEAR 0.5       /* share of the bounds on contradictions of measured states (br_state.c) */
 #define FARTHEST 3.0   /* of that on positions */
 #define FORGETTING 0.1 /* of the mean interval, by each one */
@@ -74,16 +76,30 @@ static br_fault kind_of(int state) {
     return state == BR_INDEX_DELTA ? BR_FAULT_STEERING : BR_FAULT_VELOCITY;
 }
 
-int br_instrument_near(const br_measurement *m, const br_estimate *b) {
+/* What a model may err in a state by while nothing is measured for so long: its accelerations are
+ * wrong by a share of the largest. */
+static double erring(br_fault kind, double blind_s) {
+    const int turns = kind == BR_FAULT_HEADING || kind == BR_FAULT_YAW_RATE;
+    const double along = BR_MONITOR_ACCELERATION_MPS2, about = BR_MONITOR_YAW_ACCELERATION_RADPS2;
+    const double velocity = ERRING * (turns ? about : along) * blind_s;
+    if (kind == BR_FAULT_STEERING) return 0;
+    return kind == BR_FAULT_POSITION || kind == BR_FAULT_HEADING ? velocity * blind_s / 2
+                                                                 : velocity;
+}
+
+int br_instrument_near(const br_instrument *instrument, const br_measurement *m,
+                       const br_estimate *b) {
     static const double bounds[] = {[BR_FAULT_POSITION] = BR_MONITOR_POSITION_M,
                                     [BR_FAULT_HEADING] = BR_MONITOR_HEADING_RAD,
                                     [BR_FAULT_VELOCITY] = BR_MONITOR_SPEED_MPS,
                                     [BR_FAULT_YAW_RATE] = BR_MONITOR_YAW_RATE_RADPS,
                                     [BR_FAULT_STEERING] = BR_MONITOR_STEERING_RAD};
+    const double since_s = instrument->refused_s - instrument->used_s;
+    const double blind_s = fmax(since_s - USUAL * instrument->interval_s, 0);
     for (int a = 0; a < m->count; ++a) {
-        const double off = difference(m, a, b);
-        const double noise = 3 * m->deviation[a];
-        if (!(fabs(off) <= NEAR * bounds[kind_of(m->of[a])] + noise)) return 0;
+        const br_fault kind = kind_of(m->of[a]);
+        const double most = NEAR * bounds[kind] + erring(kind, blind_s) + 3 * m->deviation[a];
+        if (!(fabs(difference(m, a, b)) <= most)) return 0;
     }
     return 1;
 }
