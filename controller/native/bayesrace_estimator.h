@@ -78,14 +78,14 @@ typedef struct {
 
 /* What has become of one instrument's measurements. */
 typedef struct {
-    int64_t used, refused;    /* refused: by the gate */
-    int64_t lost;             /* from the future, or from before what is kept */
-    int64_t left_out;         /* equal to the bit though the car moved; agreeing, of a faulty one */
-    int refused_in_row;       /* of the newest */
-    double used_s, refused_s; /* times of the newest that was used, and of the first in that row */
-    double squared, expected; /* of those used, at first: sums of the squared distances by the
-                               * covariance of what is new in them, and of how many values they
-                               * had; equal where all covariances are true */
+    int64_t used, refused; /* refused: by the gate */
+    int64_t lost;          /* from the future, or from before what is kept */
+    int64_t left_out;      /* equal to the bit though the car moved; agreeing, of a faulty one */
+    int refused_in_row;    /* of the newest */
+    double passed_s, refused_s; /* times of the newest that was not, and of the first in that row */
+    double squared, expected;   /* of those used, at first: sums of the squared distances by the
+                                 * covariance of what is new in them, and of how many values they
+                                 * had; equal where all covariances are true */
     int fault; /* br_fault: it is left out; 0: it is believed. What that follows of: */
     int bad_in_row, good_in_row;  /* of the newest */
     int seen;                     /* it has measured since the estimator began */

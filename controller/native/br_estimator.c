@@ -377,7 +377,7 @@ static void begin(br_estimator *estimator, const br_measurement *m, const br_mea
         }
     }
     estimator->instrument[m->instrument].used += 1;
-    estimator->instrument[m->instrument].used_s = m->time_s;
+    estimator->instrument[m->instrument].passed_s = m->time_s;
     insert(estimator, 0, &first);
 }
 
@@ -426,12 +426,12 @@ static int count(br_estimator *estimator, const br_event *one, double squared) {
         return 0;
     }
     instrument->refused_in_row = 0;
+    instrument->passed_s = fmax(m->time_s, instrument->passed_s);
     if (!br_instrument_good(instrument, estimator->latched)) {
         instrument->left_out += 1;
         return 0;
     }
     instrument->used += 1;
-    instrument->used_s = fmax(m->time_s, instrument->used_s);
     instrument->squared += squared;
     instrument->expected += m->count;
     if (!of_pose(m)) return 1;
@@ -448,7 +448,8 @@ static double widen(const br_estimator *estimator, const br_event *one) {
     const double gate = estimator->settings.gate;
     const br_instrument *instrument = &estimator->instrument[m->instrument];
     int contradicted;
-    if (!(gate > 0) || !estimator->agreed || !instrument->refused_in_row) return 1;
+    if (!(gate > 0) || !estimator->agreed) return 1;
+    if (!instrument->refused_in_row || instrument->fault) return 1;
     if (!br_instrument_near(instrument, m, &one->after)) return 1;
     if (br_estimator_blind(estimator, &contradicted)) return 1;
     br_estimate alone = one->after;

@@ -94,7 +94,7 @@ int br_instrument_near(const br_instrument *instrument, const br_measurement *m,
                                     [BR_FAULT_VELOCITY] = BR_MONITOR_SPEED_MPS,
                                     [BR_FAULT_YAW_RATE] = BR_MONITOR_YAW_RATE_RADPS,
                                     [BR_FAULT_STEERING] = BR_MONITOR_STEERING_RAD};
-    const double since_s = instrument->refused_s - instrument->used_s;
+    const double since_s = instrument->refused_s - instrument->passed_s;
     const double blind_s = fmax(since_s - USUAL * instrument->interval_s, 0);
     for (int a = 0; a < m->count; ++a) {
         const br_fault kind = kind_of(m->of[a]);
