@@ -167,13 +167,16 @@ def drive(car: CarParameters, make: Make) -> Drive:
     return Drive(states, u, measured)
 
 
-def estimated(estimator: Estimator, drive: Drive, late: int = 0) -> Belief:
-    """Poses but the first come so many periods late."""
+def estimated(
+    estimator: Estimator, drive: Drive, late: int = 0, poses_first: bool = False
+) -> Belief:
+    """Poses but the first come so many periods late, with what the others measure then."""
     for k, u in enumerate(drive.u):
         here = [one for one in drive.measured[k] if one.instrument != POSE]
         then = drive.measured[max(k - late, 0)] if k in (0, *range(late + 1, len(drive.u))) else []
         poses = [one for one in then if one.instrument == POSE]
-        estimator.advance(TS * (k + 1), u, VARIANCE, here + poses)
+        measured = poses + here if poses_first else here + poses
+        estimator.advance(TS * (k + 1), u, VARIANCE, measured)
     return estimator.read()
 
 
@@ -243,15 +246,17 @@ def test_the_transition_is_the_prediction_with_its_derivatives(
 
 
 @pytest.mark.parametrize("acceleration", [MODEL, WALK], ids=["model", "walk"])
-@pytest.mark.parametrize("late", [0, 2])
+@pytest.mark.parametrize(("late", "poses_first"), [(0, False), (2, False), (2, True), (6, True)])
 def test_it_is_the_textbook_filter_with_all_in_order(
-    make: Make, drive: Drive, late: int, acceleration: Floats
+    make: Make, drive: Drive, late: int, poses_first: bool, acceleration: Floats
 ) -> None:
-    """Asynchronous instruments, offsets, late measurements; with and without the model."""
+    """Asynchronous instruments, offsets, and measurements that come late: as late as 64 events
+    reach back, when what comes with them makes these the oldest. With and without the model."""
     step = make()
     made = estimator(step, acceleration=acceleration)
     expected = textbook(step, drive, late, acceleration)
-    found = estimated(made, drive, late)
+    found = estimated(made, drive, late, poses_first)
+    assert made.instrument(POSE).lost == 0
     assert found.time_s == pytest.approx(TS * len(drive.u))
     assert found.x == pytest.approx(expected.x[:9], rel=1e-9, abs=1e-11)
     p = expected.p[:9, :9]
@@ -260,6 +265,32 @@ def test_it_is_the_textbook_filter_with_all_in_order(
     if not late:
         squared = sum(made.instrument(number).squared for number in range(4))
         assert squared == pytest.approx(sum(expected.squared), rel=1e-8)
+
+
+EVENTS = 64
+"""BR_EVENTS in controller/native/bayesrace_estimator.h."""
+
+
+def test_what_has_no_place_in_a_full_history_is_lost_and_changes_nothing(
+    make: Make, drive: Drive
+) -> None:
+    """What is measured between the oldest event, which makes room, and the next one."""
+    step = make()
+    without, made = estimator(step), estimator(step)
+    expected = estimated(without, drive)
+    kept, lost = list[float](), 0
+    for k, u in enumerate(drive.u):
+        kept = sorted([*kept, TS * (k + 1)])[-EVENTS:]
+        period = drive.measured[k]
+        if len(kept) == EVENTS and kept[1] - kept[0] > 1e-6:
+            wrong = Measurement(float(np.mean(kept[:2])), WHEEL, (3,), (9.0,), (0.01,))
+            period = [wrong, *period]
+            lost += 1
+        made.advance(TS * (k + 1), u, VARIANCE, period)
+        kept = sorted([*kept, *(one.time_s for one in drive.measured[k])])[-EVENTS:]
+    assert lost > 20
+    assert made.instrument(WHEEL).lost == without.instrument(WHEEL).lost + lost
+    assert made.read().x == pytest.approx(expected.x, abs=1e-12)
 
 
 def test_it_finds_the_offsets_of_gyro_and_steering(make: Make, drive: Drive) -> None:

@@ -490,9 +490,9 @@ static void judge(br_estimator *estimator, br_event *one) {
     if (squared >= 0 && !one->left_out) one->after = with;
 }
 
-/* Everything from the k-th event on is done over. */
-static br_mpc_error redo(br_estimator *estimator, int k) {
-    for (; k < estimator->count; ++k) {
+/* The events from the k-th to before the end are done over. */
+static br_mpc_error redo(br_estimator *estimator, int k, int end) {
+    for (; k < end; ++k) {
         br_event *one = br_estimator_event(estimator, k);
         const br_event *before = br_estimator_event(estimator, k - 1);
         one->after = before->after;
@@ -507,22 +507,27 @@ static br_mpc_error redo(br_estimator *estimator, int k) {
     return BR_OK;
 }
 
-/* Puts the measurements where they belong; the first event that is to be done over. */
-static int place_all(br_estimator *estimator, double time_s, const br_measurement *measurements,
-                     int count, const br_measurement *begun_with) {
+/* Puts the measurements where they belong, and does everything over from the first of them on. */
+static br_mpc_error take_all(br_estimator *estimator, double time_s,
+                             const br_measurement *measurements, int count,
+                             const br_measurement *begun_with) {
     int from = estimator->count - 1;
     for (const br_measurement *m = measurements; m < measurements + count; ++m) {
         if (m == begun_with) continue;
+        if (from == 1 && estimator->count == BR_EVENTS) { /* done before it becomes the oldest */
+            const br_mpc_error error = redo(estimator, 1, 2);
+            if (error) return error;
+        }
         const int size = estimator->count, k = place(estimator, m);
         if (k < 0) {
             lose(estimator, m, time_s);
             continue;
         }
-        from -= estimator->count == size; /* the oldest has made room */
+        from -= from > 1 && estimator->count == size; /* the oldest has made room */
         from = k < from ? k : from;
         br_instrument_arrive(&estimator->instrument[m->instrument], m, time_s);
     }
-    return from > 1 ? from : 1;
+    return redo(estimator, from, estimator->count);
 }
 
 /* The period, with what has been measured. */
@@ -536,8 +541,7 @@ static br_mpc_error period(br_estimator *estimator, const br_event *given,
     br_estimate predicted = newest->after;
     br_mpc_error error = br_estimator_reach(estimator, end.u, end.variance, duration, &predicted);
     insert(estimator, estimator->count, &end);
-    const int from = place_all(estimator, end.time_s, measurements, count, begun_with);
-    if (!error) error = redo(estimator, from);
+    if (!error) error = take_all(estimator, end.time_s, measurements, count, begun_with);
     newest = br_estimator_event(estimator, estimator->count - 1);
     for (int i = 0; i < BR_NX; ++i)
         estimator->corrected[i] = fmax(predicted.p[i][i] - newest->after.p[i][i], 0);
