@@ -14,7 +14,7 @@ from bayesrace.messages import Reading, State
 from bayesrace.operation.closed_loop import ClosedLoop
 from tests.racing import Racing
 
-__all__ = ["FINE", "ROUGH", "Fault", "Kit", "Seen", "mocap", "odometry", "reading"]
+__all__ = ["FINE", "ROUGH", "Arriving", "Fault", "Kit", "Seen", "mocap", "odometry", "reading"]
 
 STEP_S = 0.02
 FINE, ROUGH = (0.5, 0.2), (1.0, 0.5)
@@ -22,6 +22,9 @@ FINE, ROUGH = (0.5, 0.2), (1.0, 0.5)
 
 Fault = Callable[[Reading, Reading], Reading | None]
 """What an instrument reports in place of a reading, given the last one before the fault."""
+
+Arriving = Callable[[State, State], State | None]
+"""What the controller gets of a state with readings, given the true one; None: it is lost."""
 
 
 @dataclass(frozen=True)
@@ -60,6 +63,7 @@ class Seen(ClosedLoop):
         self.driver.observe = self._see  # type: ignore[method-assign]
         self.seen: list[State] = []
         """As the controller gets them."""
+        self.arriving: Arriving = lambda seen, _: seen
         self.go_s = math.inf
         """When someone says go."""
         self.fail("", lambda reading, _: reading, 0.0, 0.0)
@@ -109,11 +113,14 @@ class Seen(ClosedLoop):
     def _see(self, state: State) -> bool:
         known = [one for one in map(self._reported, self._readings()) if one is not None]
         seen = structs.replace(state, x=(0.0,) * 7, estimated=True, readings=tuple(known))
-        self.seen.append(seen)
+        arrived = self.arriving(seen, state)
+        if arrived is None:
+            return False
+        self.seen.append(arrived)
         if state.time_s >= self.go_s:
             self.driver.go()
             self.go_s = math.inf
-        new = self._observe(seen)
+        new = self._observe(arrived)
         self.named.append((state.time_s, self.driver.fault, self.driver.faulty, self.bad))
         return new
 

@@ -107,6 +107,7 @@ def run_of(
     car: Rolling,
     answer: Callable[[State], list[Any]],
     beat: Callable[[], End | None] = lambda: None,
+    hold: Any = SimpleNamespace(missing=False),  # noqa: B008 - never written to
 ) -> tuple[Controller, End]:
     controller = Controller(answer)
     wanted = blank(
@@ -118,7 +119,7 @@ def run_of(
         states=cast(Publisher[State], controller), truths=cast(Publisher[Truth], controller),
         decoder=Decoder(Actuation), counters=RunCounters(), numbering=Numbering(),
         react=lambda _: None, beat=beat, suspended=lambda _: None,
-        hold=cast(HoldWatch, SimpleNamespace(missing=False)), epoch=7,
+        hold=cast(HoldWatch, hold), epoch=7,
     )  # fmt: skip
     return controller, run.execute()
 
@@ -153,6 +154,22 @@ def test_a_run_that_is_given_up_ends_when_the_car_stands(car: Rolling) -> None:
     _, end = run_of(car, full, beat)
     assert end.reason == "abandoned"
     assert given_up[8] > 0
+    assert car.vx_mps == 0
+
+
+def test_a_stop_after_its_director_is_lost_does_not_end_the_run_of_a_rolling_car(
+    car: Rolling,
+) -> None:
+    hold, rolled_mps = SimpleNamespace(missing=False), list[float]()
+
+    def beat() -> End | None:
+        rolled_mps.append(car.vx_mps)
+        hold.missing = len(rolled_mps) > 8
+        return End("stopped", "on request") if len(rolled_mps) == 10 else None
+
+    _, end = run_of(car, full, beat, hold)
+    assert end.reason == "stopped"
+    assert rolled_mps[9] > 0
     assert car.vx_mps == 0
 
 

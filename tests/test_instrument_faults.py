@@ -9,7 +9,7 @@ from msgspec.structs import replace
 
 from bayesrace.controller.driver import Level
 from bayesrace.messages import Reading
-from tests.instruments import FINE, ROUGH, Fault, Kit, Seen, mocap, odometry
+from tests.instruments import FINE, ROUGH, Arriving, Fault, Kit, Seen, mocap, odometry, reading
 from tests.racing import Racing, racing
 
 BEGIN_S = 0.6
@@ -178,6 +178,51 @@ def test_a_car_that_has_stopped_drives_on_after_go(race: Racing) -> None:
     assert driven.x[-1, 3] > 1
     assert {what for time_s, what, *_ in loop.named if time_s > 4.05} == {""}
     assert set(driven.levels[after[: len(driven.levels)]]) == {Level.SOLUTION}
+
+
+def test_a_car_whose_poses_have_contradicted_waits_for_go_whatever_is_lost(race: Racing) -> None:
+    """Where no state has come for so long that its estimator would begin anew, too."""
+    loop = Seen(race, mocap())
+    loop.fail("pose", changed(x=lambda x: x + 1), BEGIN_S, 1.0)
+    loop.arriving = lambda seen, _: None if 2.0 < seen.time_s < 3.5 else seen
+    loop.go_s = 5.0
+    driven = loop.drive(0, max_time_s=6.5, x0=race.moments(4)[1])
+    assert race.off_track_m(driven.x) <= 0
+    waited = (driven.time_s > 2.0) & (driven.time_s < 5.0)
+    assert abs(driven.x[waited, 3]).max() < 0.05
+    assert {who for time_s, _, who, _ in loop.named if 3.5 < time_s < 4.9} == {"pose"}
+    assert driven.x[-1, 3] > 1
+
+
+RESTING = (0.0,) * 7
+FOREIGN = tuple(reading(f"of {k}", 1.0, (1e-3,), vx=9.0) for k in range(8))
+ONE: dict[str, Arriving] = {
+    "measured": lambda seen, true: replace(true, estimated=False),
+    "measured elsewhere": lambda seen, _: replace(seen, estimated=False, readings=(), x=RESTING),
+    "dated ahead": lambda seen, _: replace(seen, time_s=seen.time_s + 0.5),
+    "dated far ahead": lambda seen, _: replace(seen, time_s=seen.time_s + 100),
+    "dated back": lambda seen, _: replace(seen, time_s=seen.time_s - 0.5),
+    "of another run": lambda seen, _: replace(seen, run=seen.run + 1, readings=FOREIGN),
+}
+
+
+@pytest.mark.parametrize("name", ONE)
+def test_one_state_of_another_kind_or_date_does_not_end_driving(race: Racing, name: str) -> None:
+    loop = Seen(race, mocap())
+    loop.arriving = lambda seen, true: (
+        ONE[name](seen, true) if abs(seen.time_s - BEGIN_S) < 1e-6 else seen
+    )
+    driven = loop.drive(0, max_time_s=BEGIN_S + 2.0, x0=race.moments(4)[1])
+    assert race.off_track_m(driven.x) <= 0
+    assert set(driven.levels[round((BEGIN_S + 0.2) / 0.02) :]) == {Level.SOLUTION}
+    assert set(loop.driver.instruments) == {"pose"}
+
+
+def test_a_car_whose_states_are_measured_after_all_is_driven(race: Racing) -> None:
+    loop = Seen(race, mocap())
+    loop.arriving = lambda seen, true: true if seen.time_s else seen
+    driven = loop.drive(0, max_time_s=1.0)
+    assert set(driven.levels[1:]) == {Level.SOLUTION}
 
 
 def test_a_car_that_rolls_at_any_speed_is_driven_after_two_poses(race: Racing) -> None:

@@ -27,6 +27,7 @@ from bayesrace.messages import Actuation, State, Telemetry, decode, encode
 from bayesrace.transport import Item, Kind, inbox, publisher
 from bayesrace.vehicles import get_car
 from tests.cycle_rig import ScriptedLaw, state
+from tests.instruments import reading
 
 MS = 1_000_000
 BEGIN_NS = 1000 * MS
@@ -114,13 +115,20 @@ class Loop:
 
         self.process._cycle.prepare = noted  # type: ignore[method-assign]
 
-    def run(self, count: int, held_up_ns: dict[int, int], final: int = -1) -> dict[str, Any]:
+    def run(
+        self,
+        count: int,
+        held_up_ns: dict[int, int],
+        final: int = -1,
+        seen: Callable[[int], dict[str, Any]] = lambda _: {},
+    ) -> dict[str, Any]:
         """Drives through so many states, of which some are held up; returns the counters.
 
-        A state held up for ever is lost.
+        A state held up for ever is lost. ``seen``: what else is in each, by its number.
         """
         for seq in range(count):
-            one = state(seq, time_s=seq * self.period_ns * 1e-9, final=seq == final)
+            changes = {"time_s": seq * self.period_ns * 1e-9, "final": seq == final} | seen(seq)
+            one = state(seq, **changes)
             self._coming.append((self.arrival_ns(seq, held_up_ns.get(seq, 0)), one))
         self._coming = deque(one for one in self._coming if one[0] < self.arrival_ns(count))
         self.process.serve()
@@ -277,3 +285,30 @@ def test_new_weights_come_after_both_cycles_of_a_release(
     drives = [one.weights_version == "new" for one in driven.actuations]
     assert drives == [False] * 10 + [True] * 11
     assert list(adoption.done) == [(driven.telemetry[10].tick, task)]
+
+
+def test_new_weights_are_on_probation_while_the_car_is_driven_by_its_states(loop: Make) -> None:
+    """Also if an instrument is faulty without which it is driven; not before its state is known."""
+
+    def seen(seq: int) -> dict[str, Any]:
+        time_s, x = seq * 0.02, float(seq >= 40)
+        pose = reading("pose", time_s, (1e-3, 1e-3, 3e-3), x=x, y=0.0, psi=0.0)
+        wheel = reading("wheel", time_s, (0.01,), vx=3.0 * (seq >= 20))
+        return {"estimated": True, "readings": (pose, wheel) if seq >= 5 else ()}
+
+    driven, counted = loop(), list[int]()
+    driver = driven.process._driver
+    faulty = dict[int, str]()
+
+    def observe(*_: Any) -> None:
+        assert driver.newest is not None
+        counted.append(driver.newest.seq)
+        faulty[counted[-1]] = driver.faulty
+
+    driven.process._adoption = MagicMock(
+        observe=observe, limits=lambda _: None, between_cycles=lambda _: None
+    )
+    driven.run(60, {}, seen=seen)
+    assert counted == list(range(5, counted[-1] + 1))
+    assert 40 <= counted[-1] < 44  # the fifth pose in a row ends it, if not its covariance
+    assert {faulty[seq] for seq in range(24, 40)} == {"wheel"}
