@@ -109,8 +109,11 @@ def test_a_pose_that_fails_is_named_and_the_car_stays_on_its_track(
         assert time_s - BEGIN_S <= max(0.15, 5 * kit.every * 0.02) + 0.081
     else:
         assert bad <= 5
-    standing = abs(driven.x[-1, 3]) < 0.05
-    assert standing or (goes_on and driven.levels[-1] == Level.SOLUTION)
+    stands, drives = abs(driven.x[-1, 3]) < 0.05, driven.levels[-1] == Level.SOLUTION
+    if goes_on and kit.fast:  # wheel speed and gyro bridge the time without poses
+        assert drives
+    else:
+        assert stands or (goes_on and drives)
 
 
 @pytest.mark.parametrize("place", [0.1, 0.45, 0.8])
