@@ -1,15 +1,14 @@
-"""From what sensors say to the state of the car: the estimator in C (bayesrace_estimator.h)."""
+"""What is measured and what is estimated, between Python and C (bayesrace_estimator.h)."""
 
-from collections.abc import Mapping, Sequence
-from typing import Any, Final, NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from bayesrace.arrays import Floats
-from bayesrace.controller.native_step import Artefact, NativeProblem
-from bayesrace.errors import InputError
+from bayesrace.controller.native_step import Artefact
 
-__all__ = ["Belief", "Estimator", "Measurement", "fill", "read"]
+__all__ = ["Belief", "Measurement", "fill", "read"]
 
 
 class Measurement(NamedTuple):
@@ -52,56 +51,3 @@ def read(artefact: Artefact, estimator: Any, found: Any) -> Belief | None:
     x = np.frombuffer(artefact.ffi.buffer(found.x), np.float64).copy()
     covariance = np.frombuffer(artefact.ffi.buffer(found.covariance), np.float64).copy()
     return Belief(found.time_s, x, covariance.reshape(len(x), len(x)))
-
-
-class Estimator:
-    """An extended Kalman filter over the model and the weights of a step; for its thread."""
-
-    def __init__(self, step: NativeProblem, settings: Mapping[str, Any]) -> None:
-        """``settings``: a br_estimation by name; InputError if unusable."""
-        self._artefact = artefact = step.artefact
-        self._step = step  # its memory has to stay
-        self._library, self._ffi, self._check = artefact.library, artefact.ffi, artefact.check
-        size = self._library.br_estimator_memory_size()
-        self._memory, handle = artefact.memory(size), self._ffi.new("br_estimator **")
-        error = self._library.br_estimator_init(self._memory, size, step.handle, handle)
-        self._check(error, "estimator")
-        self.handle: Final = handle[0]
-        error = self._library.br_estimator_set(
-            self.handle, self._ffi.new("br_estimation *", dict(settings))
-        )
-        self._check(error, "estimator's settings")
-        self._belief = self._ffi.new("br_belief *")
-
-    def advance(
-        self, time_s: float, u: Floats, variance: Floats, measured: Sequence[Measurement]
-    ) -> bool:
-        """The period that ends at ``time_s`` is over; whether anything is known yet.
-
-        ``u`` (nu,) acted in it; ``variance`` (ne,): of the residual, per stage. InputError for a
-        time before the last one.
-        """
-        given = self._ffi.new("br_measurement[]", len(measured))
-        fill(given, measured)
-        numbers = (
-            self._ffi.from_buffer("double[]", np.ascontiguousarray(one, dtype=np.float64))
-            for one in (u, variance)
-        )
-        error = self._library.br_estimator_advance(
-            self.handle, time_s, *numbers, given, len(measured)
-        )
-        if error == self._library.BR_ERROR_NOT_READY:
-            return False
-        self._check(error, "estimator")
-        return True
-
-    def read(self) -> Belief:
-        """At the end of the last period; InputError while nothing is known."""
-        belief = read(self._artefact, self.handle, self._belief)
-        if belief is None:
-            raise InputError("estimator: no position and heading have been measured yet")
-        return belief
-
-    def instrument(self, number: int) -> Any:
-        """What has become of an instrument's measurements: a br_instrument."""
-        return self._library.br_estimator_instrument(self.handle, number)

@@ -2,21 +2,19 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from msgspec import structs
 
-from bayesrace.arrays import Floats
 from bayesrace.controller.process_settings import ControllerSettings
 from bayesrace.messages import Reading, State
 from bayesrace.operation.closed_loop import ClosedLoop
+from bayesrace.sensors import BUILT_IN, Sensors
 from tests.racing import Racing
 
-__all__ = ["FINE", "ROUGH", "Arriving", "Fault", "Kit", "Seen", "mocap", "odometry", "reading"]
+__all__ = ["FINE", "ROUGH", "Arriving", "Fault", "Seen", "mocap", "odometry", "reading"]
 
-STEP_S = 0.02
 FINE, ROUGH = (0.5, 0.2), (1.0, 0.5)
 """Noise of a pose: mm, degrees."""
 
@@ -27,101 +25,69 @@ Arriving = Callable[[State, State], State | None]
 """What the controller gets of a state with readings, given the true one; None: it is lost."""
 
 
-@dataclass(frozen=True)
-class Kit:
-    """Instruments: poses every so many periods, one period late; wheel speed and gyro four times a
-    period or not at all."""
-
-    noise: tuple[float, float] = FINE
-    every: int = 1
-    fast: bool = False
-    gaps: bool = True
-    """Of poses, 100 ms every 2 s; 1 % of poses are nowhere near."""
-
-
-def mocap(noise: tuple[float, float] = FINE, every: int = 1) -> Kit:
-    return Kit(noise, every)
+def mocap(noise: tuple[float, float] = FINE, rate_hz: float = 50) -> Sensors:
+    """Late poses, with gaps of 100 ms every 2 s; 1 % of them are nowhere near."""
+    mm, degrees = noise
+    position = {"deviation": 1e-3 * mm, "outlier": 0.3}
+    heading = {"deviation": np.deg2rad(degrees), "outlier": 0.3}
+    pose = {
+        "rate_hz": rate_hz, "delay_s": 0.02, "jitter_s": 0.005, "gap_s": 0.1, "gap_every_s": 2,
+        "outliers": 0.01, "x_m": position, "y_m": position, "heading_rad": heading,
+    }  # fmt: skip
+    return Sensors.model_validate({"pose": pose})
 
 
-def odometry(noise: tuple[float, float] = FINE) -> Kit:
-    """Pose at 25 Hz, wheel speed and gyro at 200 Hz."""
-    return Kit(noise, 2, fast=True)
+def odometry(noise: tuple[float, float] = FINE) -> Sensors:
+    """The same at 25 Hz; wheel speed and gyro at 200 Hz."""
+    return Sensors({**BUILT_IN["odometry"].root, **mocap(noise, 25).root})
 
 
 class Seen(ClosedLoop):
-    """All that its controller gets are readings."""
+    """Its plant has sensors, one of which may fail."""
 
-    def __init__(
-        self, race: Racing, kit: Kit, seed: int = 0, controller: Any = None, **how: Any
-    ) -> None:
+    def __init__(self, race: Racing, sensors: Sensors, seed: int = 0) -> None:
         settings = ControllerSettings(car=race.car)
-        controller = controller or race.controller()
-        super().__init__(race.car, race.track, race.line, controller, settings=settings, **how)
-        self._kit, self._seed = kit, seed
+        loop = race.car, race.track, race.line, race.controller()
+        super().__init__(*loop, settings=settings, sensors=sensors, seed=seed)
         self.driver = self._cycle.driver
         self._observe = self.driver.observe
         self.driver.observe = self._see  # type: ignore[method-assign]
-        self.seen: list[State] = []
-        """As the controller gets them."""
         self.arriving: Arriving = lambda seen, _: seen
         self.go_s = math.inf
         """When someone says go."""
         self.fail("", lambda reading, _: reading, 0.0, 0.0)
 
     def fail(self, name: str, fault: Fault, begin_s: float, lasts_s: float) -> None:
-        """From plant time begin_s on."""
+        """What is measured from plant time begin_s on."""
         self._failing, self._fault, self._begin_s = name, fault, begin_s
         self._end_s = begin_s + lasts_s
-        self._random = np.random.default_rng(self._seed)
         self._good: Reading | None = None
-        self.bad = 0
-        """Readings of the fault so far, those that do not come included."""
+        self._bad = 0
         self.named: list[tuple[float, str, str, int]] = []
-        """Of each state: plant time, the fault, its instrument, and those."""
-
-    def _pose(self, time_s: float, x: Floats) -> Reading:
-        mm, degrees = self._kit.noise
-        deviation = np.array([1e-3 * mm, 1e-3 * mm, np.deg2rad(degrees)])
-        value = self._random.normal(x[:3], deviation)
-        if self._random.random() < 0.01:
-            value = value + self._random.normal(0, 0.3, 3)
-        return reading("pose", time_s, x=value[0], y=value[1], psi=value[2], deviation=deviation)
-
-    def _readings(self) -> list[Reading]:
-        now = len(self._true_x) - 1
-        then, found = now - 1, []
-        if then >= 0 and then % self._kit.every == 0 and (STEP_S * then + 1) % 2 > 0.1:
-            found.append(self._pose(STEP_S * then, np.array(self._true_x[then])))
-        for k in range(1, 5) if self._kit.fast and now else ():
-            part = k / 4
-            x = (1 - part) * np.array(self._true_x[now - 1]) + part * np.array(self._true_x[now])
-            time_s = STEP_S * (now - 1 + part)
-            speed = max(0.01 * abs(x[3]), 0.005)
-            gyro, wheel = self._random.normal([x[5] + 0.05, x[3]], [0.02, speed])
-            found.append(reading("gyro", time_s, omega=gyro, deviation=(0.02,)))
-            found.append(reading("wheel", time_s, vx=wheel, deviation=(speed,)))
-        return found
+        """Of each state: plant time, the fault, its instrument, and how many readings of the fault
+        there were before it, those that do not come included."""
 
     def _reported(self, one: Reading) -> Reading | None:
         if one.instrument != self._failing or not self._begin_s <= one.time_s < self._end_s:
             self._good = one if one.instrument == self._failing else self._good
             return one
-        self.bad += 1
+        self._bad += 1
         assert self._good is not None
         return self._fault(one, self._good)
 
     def _see(self, state: State) -> bool:
-        known = [one for one in map(self._reported, self._readings()) if one is not None]
-        seen = structs.replace(state, x=(0.0,) * 7, estimated=True, readings=tuple(known))
-        arrived = self.arriving(seen, state)
+        bad = self._bad
+        known = [one for one in map(self._reported, state.readings) if one is not None]
+        seen = structs.replace(state, readings=tuple(known))
+        true = structs.replace(state, readings=(), estimated=False, x=self._true_x[-1])
+        arrived = self.arriving(seen, true)
         if arrived is None:
             return False
-        self.seen.append(arrived)
         if state.time_s >= self.go_s:
             self.driver.go()
             self.go_s = math.inf
         new = self._observe(arrived)
-        self.named.append((state.time_s, self.driver.fault, self.driver.faulty, self.bad))
+        self.named.append((state.time_s, self.driver.fault, self.driver.faulty, bad))
         return new
 
 

@@ -7,8 +7,6 @@ import socket
 import subprocess
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -29,14 +27,14 @@ from bayesrace.operation.closed_loop import ClosedLoop
 from bayesrace.vehicles import CarParameters
 from tests import sample_messages as messages
 from tests.conftest import SETTINGS, Circuit
-from tests.instruments import Seen, odometry, reading
+from tests.instruments import odometry, reading
 from tests.native_programs import SANITIZED, native_program
 from tests.programs import ROOT
 
 SOURCE = ROOT / "examples" / "c_host"
 LAPS = 1
-INSTRUMENTS = ("gyro", "wheel", "pose")
-"""By number, as they come first."""
+INSTRUMENTS = ("pose", "wheel", "gyro")
+"""By number."""
 
 
 @pytest.fixture(scope="module")
@@ -118,14 +116,14 @@ def test_a_drive_by_readings_is_answered_to_the_bit(
     program: Path, data: Path, tmp_path: Path, native: NativeStep, circuit: Circuit,
     car: CarParameters, weights: GpWeights, kinematic_artefact: Path,
 ) -> None:  # fmt: skip
-    track, line = circuit.track, circuit.line
-    race: Any = SimpleNamespace(car=car, track=track, line=line)
     log = LogWriter(tmp_path / "log.mcap")
-    loop = Seen(race, odometry(), controller=PredictiveController(native), log=log)
+    loop = ClosedLoop(
+        car, circuit.track, circuit.line, PredictiveController(native), log=log, sensors=odometry()
+    )
     loop.drive(LAPS, max_time_s=6.0)
     log.close()
-    rows = answers(program, data, loop.seen)
-    sent = LogReader(tmp_path / "log.mcap").select(ACTUATION)
+    reader = LogReader(tmp_path / "log.mcap")
+    rows, sent = answers(program, data, reader.select(STATE)), reader.select(ACTUATION)
     assert len(rows) == len(sent) > 100
     for row, one in zip(rows, sent, strict=True):
         assert tuple(map(float, row[3:6])) == (one.decided_at_s, *one.u)

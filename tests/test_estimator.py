@@ -12,7 +12,7 @@ import pytest
 from bayesrace.arrays import Floats
 from bayesrace.codegen.build import build
 from bayesrace.codegen.settings import BuildSettings
-from bayesrace.controller.estimator import Belief, Estimator, Measurement
+from bayesrace.controller.estimator import Belief, Measurement
 from bayesrace.controller.native_step import NativeStep
 from bayesrace.errors import InputError
 from bayesrace.gp.expression import mean_function
@@ -27,6 +27,8 @@ from bayesrace.tracks import load_track
 from bayesrace.vehicles import CarParameters, get_car
 from bayesrace.vehicles.models import e_kinematic
 from tests.conftest import SETTINGS, Make, smooth_drive
+from tests.estimator import Estimator
+from tests.instruments import FINE, ROUGH, mocap
 from tests.racing import Racing, racing
 
 TS = 0.02
@@ -415,20 +417,9 @@ def test_its_covariance_is_that_of_its_errors_on_a_learned_car(
     assert (rmse < (0.006, 0.01, 0.08)).all()
 
 
-def motion_capture(mm: float, degrees: float) -> Sensors:
-    """Late poses, with gaps of 100 ms, 1 % of them nowhere near."""
-    position = {"deviation": 1e-3 * mm, "outlier": 0.3}
-    heading = {"deviation": np.deg2rad(degrees), "outlier": 0.3}
-    pose = {
-        "rate_hz": 50, "delay_s": 0.02, "jitter_s": 0.005, "gap_s": 0.1, "gap_every_s": 2,
-        "outliers": 0.01, "x_m": position, "y_m": position, "heading_rad": heading,
-    }  # fmt: skip
-    return Sensors.model_validate({"pose": pose})
-
-
 @pytest.mark.parametrize(
     "sensors",
-    [motion_capture(0.5, 0.2), motion_capture(1.0, 0.5), get_sensors("odometry")],
+    [mocap(FINE), mocap(ROUGH), get_sensors("odometry")],
     ids=["0.5 mm", "1 mm", "odometry"],
 )
 def test_a_car_that_instruments_measure_laps_as_if_its_state_were_known(sensors: Sensors) -> None:
@@ -445,12 +436,12 @@ def test_a_car_that_instruments_measure_laps_as_if_its_state_were_known(sensors:
 
 
 @pytest.mark.parametrize("name", ["orca", "f1tenth"])
-@pytest.mark.parametrize("noise", [(0.5, 0.2), (1.0, 0.5)])
+@pytest.mark.parametrize("noise", [FINE, ROUGH])
 def test_a_training_drive_by_motion_capture_stays_on_its_track(
     name: str, noise: tuple[float, float], tmp_path: Path
 ) -> None:
     """Its estimates are those of the model without weights."""
-    car, sensors = get_car(name), motion_capture(*noise)
+    car, sensors = get_car(name), mocap(noise)
     track = load_track(car.train_track, car.width_m)
     line = compute_raceline(track, car)
     settings = PreparationSettings(car=car, sensors=sensors)
