@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from typing import Final
 
 from bayesrace.messages import Reading, RunRequest, State, Truth
-from bayesrace.plant.hardware import Hardware
 from bayesrace.plant.sensors import SensorPlayer
 from bayesrace.plant.vehicle import FmuFault, Vehicle
 from bayesrace.sensors import EXACT, Sensors
@@ -112,7 +111,7 @@ class CarRun:
             request.line_right_m,
         )
         vehicle.reset(request.x0)
-        start = vehicle.x.tolist() if isinstance(vehicle, Hardware) else request.x0
+        start = vehicle.x.tolist() if vehicle.real else request.x0
         self._line.restart(start[0], start[1])
 
     @property
@@ -151,9 +150,9 @@ class CarRun:
 
     def _readings(self, x: tuple[float, ...]) -> tuple[Reading, ...] | None:
         """What instruments report; None: the whole state is measured."""
-        if isinstance(self.vehicle, Hardware):
+        if self._sensors is None or self.vehicle.real:
             return self.vehicle.readings()
-        return None if self._sensors is None else self._sensors.report(self.vehicle.time_s, x)
+        return self._sensors.report(self.vehicle.time_s, x)
 
     def step(self, u: tuple[float, ...], seq: int) -> None:
         """One period of lockstep, from the sample ``seq`` that ``u`` answers. FmuFault."""

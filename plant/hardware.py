@@ -100,6 +100,8 @@ class Hardware(Vehicle):
     A context manager: a thread waits in :meth:`receive` meanwhile.
     """
 
+    real = True
+
     def __init__(
         self,
         car: CarParameters,

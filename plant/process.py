@@ -25,7 +25,6 @@ from bayesrace.messages import (
     Status,
 )
 from bayesrace.plant.car import End
-from bayesrace.plant.hardware import Hardware
 from bayesrace.plant.process_settings import PlantSettings
 from bayesrace.plant.run import Run, RunCounters
 from bayesrace.plant.vehicle import Compile, FmuFault, Vehicle, open_vehicle
@@ -79,7 +78,6 @@ class PlantProcess:
         self._run: Run | None = None
         self._run_number = 0
         self._runs = 0
-        self._hardware = vehicle if isinstance(vehicle, Hardware) else None
         self._text = f"no run so far with {_played_by(settings, vehicle)}"
         self._stopping = False
         self._spare_s = 0.0
@@ -145,7 +143,7 @@ class PlantProcess:
                 "this plant was started for lockstep (--low-latency): "
                 "start it without to drive in real time"
             )
-        if message.lockstep and self._hardware is not None:
+        if message.lockstep and self._simulator.real:
             return "a real car does not wait for its controller: drive with --mode realtime"
         if message.held and message.lockstep:
             return "hold-to-run is for real time (--mode realtime): lockstep waits for its director"
@@ -296,12 +294,6 @@ class PlantProcess:
             return End("abandoned", f"{gone} for {_ABANDONED_S:g} s")
         return None
 
-    @property
-    def _words(self) -> str:
-        if self._hardware is None:
-            return self._text
-        return f"{self._text}; {self._hardware.report()}"
-
     def _status(self, seq: int = 0) -> Status:
         phase = "idle" if self._run is None else "running"
         now_ns = time.monotonic_ns()
@@ -312,7 +304,7 @@ class PlantProcess:
             phase=phase,
             epoch=self._epoch,
             run=self._run_number,
-            text=self._words[:2000],
+            text="; ".join(filter(None, (self._text, self._simulator.report())))[:2000],
             weights_version="",
             track="",
             rate_hz=self._settings.rate_hz,
@@ -326,7 +318,7 @@ class PlantProcess:
 
 
 def _played_by(settings: PlantSettings, vehicle: Vehicle) -> str:
-    if isinstance(vehicle, Hardware):
+    if vehicle.real:
         return "a real car"
     if settings.fmu is not None:
         return f"FMU {settings.fmu.name}"
@@ -334,12 +326,13 @@ def _played_by(settings: PlantSettings, vehicle: Vehicle) -> str:
 
 
 def main(
-    settings: PlantSettings, compiled: Compile | None = None, hardware: Hardware | None = None
+    settings: PlantSettings, compiled: Compile | None = None, hardware: Vehicle | None = None
 ) -> int:
     """Run a plant until SIGINT or SIGTERM; returns the exit code. Raises InputError at a bad start.
 
     ``compiled``: of the car's equations, see :class:`bayesrace.plant.simulator.Simulator`.
-    ``hardware``: the real car, which is open, instead of a simulated one.
+    ``hardware``: the real car (:class:`bayesrace.plant.hardware.Hardware`), which is open, instead
+    of a simulated one.
     Call it from the main thread of a process: it takes over the signals.
     """
     die_with_parent(settings.parent_pid)

@@ -10,7 +10,6 @@ from typing import Final, NamedTuple
 
 from bayesrace.messages import ACTUATION, Actuation, BrakingPlan, Decoder, RunRequest, State, Truth
 from bayesrace.plant.car import CarRun, End, drive_lockstep, fault_end, truth_behind
-from bayesrace.plant.hardware import Hardware
 from bayesrace.plant.vehicle import Command, FmuFault, Vehicle, planned_at
 from bayesrace.realtime import SUSPENDED_S, sleep_until_ns
 from bayesrace.sensors import EXACT, Sensors
@@ -107,8 +106,6 @@ class Run:
         the car from then on."""
         self._over: End | None = None
         """Why a real car is being stopped."""
-        self._hardware = self.simulator if isinstance(self.simulator, Hardware) else None
-        self._late_s = 0.0 if self._hardware is None else self._hardware.command_s
 
     @property
     def laps(self) -> int:
@@ -135,7 +132,7 @@ class Run:
     def _send(self, state: State, x: tuple[float, ...]) -> None:
         """The truth goes second: it must not delay the measurement. Of a real car there is none."""
         self.states.put(state, lockstep=state.lockstep)
-        if self._hardware is None:
+        if not self.simulator.real:
             self.truths.put(truth_behind(state, x), lockstep=state.lockstep)
 
     # Lockstep ----------------------------------------------------------------------------------
@@ -180,7 +177,7 @@ class Run:
         seq = self.states.next_seq
         first = self._car.sample(seq)
         start_ns, late_ns = first[0].source_time_ns, 0
-        self._anchor(start_ns)
+        self.simulator.begins(start_ns)
         self._enqueue(*first)
         while True:
             begin_ns = start_ns + self.simulator.steps * period_ns
@@ -191,7 +188,7 @@ class Run:
                 self.counters.suspended += 1
                 self.suspended(late_ns * 1e-9)
                 start_ns, begin_ns, late_ns = start_ns + late_ns, begin_ns + late_ns, 0
-                self._anchor(start_ns)
+                self.simulator.begins(start_ns)
             self.counters.overruns += late_ns > period_ns
             asked = end or self._receive()
             if asked is None and self._lost_s is None and self.hold.missing:
@@ -216,8 +213,8 @@ class Run:
         """What ends the run in the state just reached; of a car that is being stopped, that it
         stands."""
         end = self._car.finished()
-        if end is None and self._hardware is not None and self._hardware.silent:
-            end = End("plant_fault", self._hardware.silent)
+        if end is None and (why := self.simulator.silent):
+            end = End("plant_fault", why)
         if self._lost_s is None or (end is not None and end.reason == "left_world"):
             return end
         if self._rolls and self.time_s < self._lost_s + _STOPPING_S:
@@ -228,28 +225,24 @@ class Run:
     @property
     def _rolls(self) -> bool:
         """Of a car that cannot be seen: that its braking plan is not over."""
-        if self._hardware is not None and self._hardware.silent:
+        if self.simulator.silent:
             return planned_at(self._braking, self.time_s) is not None
         return abs(float(self.simulator.x[3])) > _STANDING_MPS
 
     def _halting(self, end: End | None) -> End | None:
         """A run of a real car does not end before it stands, unless it is asked to twice."""
-        if end is None or self._hardware is None or self._over is not None or not self._rolls:
+        if end is None or not self.simulator.real or self._over is not None or not self._rolls:
             return end
         self._lost_s = self.time_s if self._lost_s is None else self._lost_s
         self._over = end
         return None
 
-    def _anchor(self, start_ns: int) -> None:
-        if self._hardware is not None:
-            self._hardware.begins(start_ns)
-
     def _pass(self, until_ns: int) -> End | None:
         """The rest of a period; a real car meanwhile does what comes as soon as it comes."""
-        if self._hardware is None:
+        if not self.simulator.real:
             self._sleep_and_send(until_ns)
             return None
-        self._hardware.actuate(self._fresh(0))
+        self.simulator.actuate(self._fresh(0))
         acting = self._held
         while (left_ns := until_ns - time.monotonic_ns()) > 0:
             if (end := self._receive(left_ns * 1e-9)) is not None:
@@ -258,7 +251,7 @@ class Run:
             if new is None or self._lost_s is not None:
                 continue
             if acting is None or _decided(new) > _decided(acting):
-                self._hardware.actuate(new.u)
+                self.simulator.actuate(new.u)
                 acting = new
         return None
 
@@ -332,7 +325,7 @@ class Run:
             self._interval_s = min(new.decided_at_s - before_s, _LONGEST_S)
             self._held, done = new, at
             self._held_since_s = simulator.time_s + at * substep_ns * 1e-9
-            acting_s = self._held_since_s - new.decided_at_s + self._late_s
+            acting_s = self._held_since_s - new.decided_at_s + simulator.command_s
             delays += (float(new.state_seq), arrival_s, acting_s)
         if done < simulator.substeps:
             commands.append((simulator.substeps - done, self._fresh(done)))

@@ -13,13 +13,13 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, ClassVar, Final
 
 import numpy as np
 
 from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
-from bayesrace.messages import BrakingPlan
+from bayesrace.messages import BrakingPlan, Reading
 from bayesrace.plant.settings import SimulatorName
 from bayesrace.vehicles.parameters import CarParameters
 
@@ -163,6 +163,12 @@ class Vehicle(ABC):
     next :meth:`reset` begins with a car as new.
     """
 
+    real: ClassVar[bool] = False
+    """Whether it is a real car, whose true state is not known: it does not wait for its periods,
+    a command acts at once (:meth:`actuate`), and its runs end when it stands."""
+    command_s: float = 0.0
+    """From sending a command to its acting."""
+
     def __init__(self, car: CarParameters, step_s: float, substeps: int) -> None:
         self.car = car
         """Whose limits the guard keeps."""
@@ -225,6 +231,27 @@ class Vehicle(ABC):
             raise
         self.u_applied = d_sum / self.substeps, rate_sum / self.substeps
         self.steps += 1
+
+    @property
+    def silent(self) -> str:
+        """Why a real car has to stop; else empty."""
+        return ""
+
+    def readings(self) -> tuple[Reading, ...] | None:
+        """What instruments of its own have measured since they were asked last; None: it has
+        none, and its state is known."""
+        return None
+
+    def report(self) -> str:
+        """What the plant's status says of it, if anything."""
+        return ""
+
+    def begins(self, zero_ns: int) -> None:  # noqa: B027 - a simulated car needs no clock
+        """Plant time 0 is at this moment of the monotonic clock."""
+
+    def actuate(self, u: Command) -> None:
+        """A command that acts from now on; for real cars."""
+        raise NotImplementedError("a simulated car waits for its periods")
 
     @abstractmethod
     def _place(self, start: Floats) -> None:
