@@ -57,8 +57,8 @@ def state(run: int, seq: int, x: Floats, u: Floats, **known: Any) -> State:
     return blank(State, **({"seq": seq, "epoch": 1, "run": run} | car | known))
 
 
-def telemetry(run: int, state_seq: int, fallback: int) -> Telemetry:
-    return blank(Telemetry, seq=state_seq, run=run, state_seq=state_seq, fallback=fallback)
+def telemetry(run: int, state_seq: int, fallback: int, **known: Any) -> Telemetry:
+    return blank(Telemetry, seq=state_seq, run=run, state_seq=state_seq, fallback=fallback, **known)
 
 
 def logged(data: Dataset, run: int) -> list[State]:

@@ -70,19 +70,43 @@ def test_laps_are_timed_from_crossing_to_crossing(states: list[State]) -> None:
     assert laps[1].versions == ["v0", "v1"]
 
 
-def test_with_the_track_crossings_are_interpolated() -> None:
-    """A car at 1.5 m/s on a circle crosses the line between two samples, as geometry says."""
+SPEED = 1.5
+
+
+def circled(count: int, late_s: float = 0.0) -> tuple[Track, list[State]]:
+    """A car on a circle of 1 m, whose plant counts laps so late."""
     angle = 2 * np.pi * np.arange(128) / 128
     track = Track.from_points("circle", np.column_stack([np.cos(angle), np.sin(angle)]), 0.2, 0.2)
-    speed, count = 1.5, 450
-    at = speed * STEP_S * np.arange(count) + 1e-6
+    at = SPEED * STEP_S * np.arange(count) + 1e-6
     x = np.zeros((count, 7))
-    x[:, 0], x[:, 1], x[:, 3] = np.cos(at), np.sin(at), speed
-    lap = np.floor(at / (2 * np.pi)).astype(int)
-    states = [state(0, k, x[k], np.zeros(2), lap=int(lap[k])) for k in range(count)]
+    x[:, 0], x[:, 1], x[:, 2], x[:, 3] = np.cos(at), np.sin(at), at + np.pi / 2, SPEED
+    lap = np.maximum(np.floor((at - SPEED * late_s) / (2 * np.pi)), 0).astype(int)
+    return track, [state(0, k, x[k], np.zeros(2), lap=int(lap[k])) for k in range(count)]
+
+
+@pytest.mark.parametrize("late_s", [0.0, 0.05])
+def test_estimated_crossings_are_interpolated(late_s: float) -> None:
+    """By the estimates in the telemetry; a run's last state, at the line too, has none."""
+    track, exact = circled(450, late_s)
+    made, taken = Collector(CAR, STEP_S, track), []
+    for one in exact[: [one.lap for one in exact].index(2) + 1]:
+        final = one.lap == 2
+        made.state(replace(one, x=(0.0,) * 7, estimated=True, final=final))
+        taken += made.take()
+        known = {"estimate": (*one.x, 0.0, 0.0), "deviation": (1e-3,) * 9}
+        if not final:
+            made.telemetry(telemetry(0, one.seq, 0, **known))
+    laps = [one.lap for one in taken + made.take(at_once=True)]
+    times = [lap.time_s for lap in laps if lap is not None]
+    assert times == pytest.approx([2 * np.pi / SPEED] * 2, abs=1e-3)
+
+
+def test_with_the_track_crossings_are_interpolated() -> None:
+    """A car at 1.5 m/s on a circle crosses the line between two samples, as geometry says."""
+    track, states = circled(450)
     taken, _ = fed(states, track=track)
     times = [one.lap.time_s for one in taken if one.lap is not None]
-    assert times == pytest.approx([2 * np.pi / speed] * 2, abs=2e-3)
+    assert times == pytest.approx([2 * np.pi / SPEED] * 2, abs=2e-3)
     assert all(one.lap is not None and one.lap.off_track_m == 0.0 for one in taken)
     far = [replace(one, x=(1.3 * one.x[0], 1.3 * one.x[1], *one.x[2:])) for one in states]
     taken, _ = fed(far, track=track)

@@ -1,5 +1,6 @@
 """Laps and their samples, collected from messages as they arrive."""
 
+import math
 import time
 from collections import deque
 from dataclasses import dataclass, field
@@ -7,7 +8,8 @@ from typing import Final
 
 import numpy as np
 
-from bayesrace.columns import columns_of, with_estimates
+from bayesrace.arrays import Floats
+from bayesrace.columns import Columns, columns_of, with_estimates
 from bayesrace.errors import InputError
 from bayesrace.learning.dataset import Dataset
 from bayesrace.learning.sources import CYCLES, STATES, dataset_from_columns
@@ -28,6 +30,10 @@ _STALL_S: Final = 0.1
 """The most by which one call of :meth:`Collector.take` advances that time: what arrives during a
 stall of this host can only be read after it."""
 
+_NEAR: Final = 5.0
+"""So many times the way between two states may the car be off the line between which it counts:
+plants count by positions of their own."""
+
 _REMEDIES: Final = {
     "standstill": "the car stood still, or nearly; see 'bayesrace status' for why",
     "gap": "messages are lost; give the network and this machine less to do",
@@ -46,7 +52,7 @@ class Stretch:
     """What is driven up to the end of a lap, or a part of it."""
 
     flying: bool = False
-    begin_s: float | None = None  # plant time when the lap began, if that was seen
+    first: bool = False  # of its run
     states: list[State] = field(default_factory=list)
     versions: dict[str, None] = field(default_factory=dict)
     reported: int = -1  # newest state of this run in the telemetry so far
@@ -69,6 +75,8 @@ class Collector:
         """``track``: times laps to less than a period, and measures excursions."""
         self._car, self._step_s, self._track = car, step_s, track
         self._line = None if track is None else StartLine(track)
+        self._begin_s: float | None = None
+        """Plant time when the lap began that is evaluated next, if that was seen."""
         self._open = Stretch()
         self._ended: deque[Stretch] = deque()
         self._run, self._laps = (-1, -1), 0
@@ -79,7 +87,7 @@ class Collector:
     def state(self, state: State) -> None:
         """Adds a state of the plant."""
         if (state.epoch, state.run) != self._run:
-            self._end(Stretch(begin_s=state.time_s if state.time_s == 0 else None))
+            self._end(Stretch(first=True))
             self._run, self._laps = (state.epoch, state.run), state.lap
         states = self._open.states
         if states and state.seq <= states[-1].seq:
@@ -88,7 +96,7 @@ class Collector:
         if state.lap > self._laps:
             self._end_lap(state)
         elif len(states) >= MOST_STATES:  # the lap keeps its time, should it ever end
-            self._end(Stretch(self._open.flying, self._open.begin_s, [state]))
+            self._end(Stretch(self._open.flying, states=[state]))
         if state.final:
             self._end(Stretch())
             self._run = (-1, -1)
@@ -122,29 +130,39 @@ class Collector:
 
     def _is_complete(self, stretch: Stretch) -> bool:
         """Whether all telemetry of the stretch has arrived, or is waited for no longer."""
-        last_cycle = stretch.states[-2].seq  # that of the last state belongs to the next stretch
+        before, last = stretch.states[-2:]  # whose cycle belongs to the next stretch, but ...
+        estimated = last.estimated and not last.final  # ... says where it is
+        last_cycle = last.seq if estimated else before.seq
         return stretch.reported >= last_cycle or self._waited_s >= stretch.end_s + _PATIENCE_S
 
     def _end_lap(self, state: State) -> None:
         """The plant has counted a lap: this state is the first one behind the line."""
-        stretch, counted = self._open, state.lap - self._laps
         self._laps = state.lap
-        crossed_s, time_s = self._crossing_s(stretch.states), None
-        if crossed_s is not None and stretch.begin_s is not None and counted == 1:
-            time_s = crossed_s - stretch.begin_s
-        stretch.lap = LapRecord(run=state.run, time_s=time_s, flying=stretch.flying)
-        self._end(Stretch(flying=True, begin_s=crossed_s, states=[state]))
+        self._open.lap = LapRecord(run=state.run, time_s=None, flying=self._open.flying)
+        self._end(Stretch(flying=True, states=[state]))
 
-    def _crossing_s(self, states: list[State]) -> float | None:
-        """Plant time at the line; None if the states around it are missing."""
-        if len(states) < 2 or states[-1].time_s - states[-2].time_s > 0.1:
+    def _lap_time_s(self, crossed_s: float | None, counted: int) -> float | None:
+        """Of the laps that were counted at that time, if it is one; None: not known."""
+        begin_s, self._begin_s = self._begin_s, crossed_s
+        if begin_s is None or crossed_s is None or counted != 1:
             return None
-        before, after = states[-2], states[-1]
-        if self._line is not None:
-            crossing = self._line.crossing(before.x[:2], after.x[:2])
-            if crossing.direction == 1:
-                return before.time_s + crossing.fraction * (after.time_s - before.time_s)
-        return after.time_s
+        return crossed_s - begin_s
+
+    def _crossing_s(self, around: Columns, cycles: Columns) -> float | None:
+        """Plant time at the line, which was counted between these two states; None if others are
+        missing there."""
+        before_s, after_s = map(float, around["time_s"])
+        if after_s - before_s > 0.1:
+            return None
+        known = with_estimates(around, cycles)
+        if self._line is None or not len(known) or known["seq"][0] != around["seq"][0]:
+            return after_s
+        x = known["x"]  # nothing is estimated of a run's last state
+        after = x[1] if len(x) > 1 else _moved(x[0], after_s - before_s)
+        before_m, after_m = (float(self._line.signed_distance(*at[:2])) for at in (x[0], after))
+        if after_m <= before_m or max(abs(before_m), abs(after_m)) > _NEAR * (after_m - before_m):
+            return after_s
+        return before_s - before_m / (after_m - before_m) * (after_s - before_s)
 
     def _end(self, following: Stretch) -> None:
         if len(self._open.states) > 1:
@@ -155,6 +173,8 @@ class Collector:
     def _evaluate(self, stretch: Stretch) -> None:
         states, lap = stretch.states, stretch.lap
         run, first, last = states[0].run, states[0].seq, states[-1].seq
+        if stretch.first:
+            self._begin_s = 0.0 if states[0].time_s == 0 else None
         cycles = [one for one in self._cycles if one.run == run and one.state_seq >= first]
         columns = columns_of(State, states, STATES), columns_of(Telemetry, cycles, CYCLES)
         samples, why_not = None, ""
@@ -171,9 +191,18 @@ class Collector:
         if lap is not None:
             fallbacks = {one.state_seq for one in cycles if one.fallback and one.state_seq < last}
             lap.versions, lap.fallbacks = list(stretch.versions), len(fallbacks)
+            crossed_s = self._crossing_s(columns[0][-2:], columns[1])
+            lap.time_s = self._lap_time_s(crossed_s, states[-1].lap - states[0].lap)
             if samples is not None:
                 lap.samples, lap.left_out = len(samples), samples.dropped
             known = with_estimates(*columns)["x"]
             if self._track is not None and len(known):
                 path = self._track.project_path(known[:, :2])
                 lap.off_track_m = max(float(np.max(path.off_track_m)), 0.0)
+
+
+def _moved(x: Floats, duration_s: float) -> Floats:
+    """The position (2,) of a state (7,) after so short a time."""
+    cos, sin = math.cos(x[2]), math.sin(x[2])
+    moved: Floats = x[:2] + duration_s * (np.array([[cos, -sin], [sin, cos]]) @ x[3:5])
+    return moved
