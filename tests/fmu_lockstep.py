@@ -12,6 +12,7 @@ from typing import Any, Literal
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from bayesrace.arrays import Floats
 from bayesrace.codegen.fmu import FmuDefinition, controller_fmu, pack
@@ -21,7 +22,10 @@ from bayesrace.controller.native_step import NativeStep, StepStatus
 from bayesrace.controller.process_settings import ControllerSettings
 from bayesrace.controller.settings import CompensationSettings, FallbackSettings
 from bayesrace.gp.weights import GpWeights
+from bayesrace.messages import Reading
+from bayesrace.plant.sensors import SensorPlayer
 from bayesrace.plant.simulator import Simulator
+from bayesrace.sensors import EXACT, Sensors
 from bayesrace.vehicles import CarParameters
 from bayesrace.vehicles.models import STATES, dynamic
 from tests import sample_messages as messages
@@ -65,6 +69,11 @@ class Lockstep:
     u: list[Floats] = field(default_factory=list)
     said: list[tuple[int, int]] = field(default_factory=list)
     """Status and level."""
+    applied: list[tuple[float, ...]] = field(default_factory=list)
+    """In the period before each state."""
+    sensors: Sensors = EXACT
+    readings: list[tuple[Reading, ...]] = field(default_factory=list)
+    """Of the sensors, if there are any; then states are not known."""
 
     def __post_init__(self) -> None:
         compensation = CompensationSettings(mode="fixed", delay_s=self.delay_s)
@@ -74,6 +83,7 @@ class Lockstep:
         )
         self.driver = Driver(controller, self.car, settings)
         self.plant = Simulator(dynamic(self.car))
+        self.player = SensorPlayer(self.sensors)
 
     def answer(self, seq: int, x: Floats) -> Floats:
         """The input for one state."""
@@ -81,10 +91,14 @@ class Lockstep:
             seq, time_s=seq * STEP_S, x=tuple(x), u_applied=self.plant.u_applied,
             lockstep=not self.delay_s,
         )  # fmt: skip
+        if self.sensors.root:
+            self.readings.append(self.player.report(state.time_s, state.x))
+            state = replace(state, x=(0.0,) * 7, estimated=True, readings=self.readings[-1])
         self.driver.observe(state)
         decision = self.driver.decide(state.time_s)
         self.driver.prepare(STEP_S)
         self.x.append(x)
+        self.applied.append(state.u_applied)
         self.u.append(np.array([decision.d, decision.delta_rate]))
         self.said.append((decision.status, int(decision.level)))
         return self.u[-1]
@@ -127,12 +141,14 @@ class Exported:
         }
         return controller_fmu(**(values | changes))
 
-    def lockstep(self, delay_s: float = 0.0, tolerance: float = 1.0) -> Lockstep:
+    def lockstep(
+        self, delay_s: float = 0.0, tolerance: float = 1.0, sensors: Sensors = EXACT
+    ) -> Lockstep:
         """The same controller in one process with the plant."""
         native = NativeStep(self.artefact, self.car, RACING)
         native.set_weights(self.weights)
         native.set_path(self.circuit.table)
-        return Lockstep(native, self.car, delay_s, tolerance)
+        return Lockstep(native, self.car, delay_s, tolerance, sensors=sensors)
 
     def fmu(self, version: Literal[2, 3]) -> Path:
         """The controller's."""

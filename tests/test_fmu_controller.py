@@ -1,13 +1,20 @@
 """The controller as an FMU in a plain FMI master: the lap of the lockstep run, no bad input."""
 
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
 import pytest
+from fmpy.fmi1 import FMICallException
 from fmpy.validation import validate_fmu
 
+from bayesrace.arrays import Floats
+from bayesrace.codegen.fmu import pack
 from bayesrace.controller.driver import DOUBTED, UNPREDICTABLE, Level
 from bayesrace.controller.native_step import StepStatus
+from bayesrace.errors import InputError
+from bayesrace.messages import Reading
+from bayesrace.sensors import Sensors
 from bayesrace.vehicles import get_car
 from bayesrace.vehicles.models import STATES
 from tests.car_fmu import packed_car
@@ -16,13 +23,15 @@ from tests.fmu_lockstep import (  # noqa: F401 - a fixture is used by name
     STEP_S,
     STEPS,
     Exported,
+    Lockstep,
     answers,
     exported_controllers,
     same,
     strewn,
     versions,
 )
-from tests.fmu_master import drive
+from tests.fmu_master import Slave, drive
+from tests.instruments import mocap, odometry
 
 
 @versions
@@ -212,3 +221,57 @@ def test_what_acts_may_be_connected(exported: Exported) -> None:
     connected.set({"d_applied": -0.1})
     changed = answers(connected, [run.x[-1]])
     assert changed[0, 0] < rows[-1][0] - 0.01
+
+
+def seen(slave: Slave, run: Lockstep) -> Floats:
+    """What an FMU says in each period of four steps; one reading of an instrument comes a step."""
+    rows, times = [], 4
+    for k, (readings, applied) in enumerate(zip(run.readings, run.applied, strict=True)):
+        queues: dict[str, list[Reading]] = {}
+        for one in readings:
+            queues.setdefault(one.instrument, []).append(one)
+        slave.set(dict(zip(("d_applied", "delta_rate_applied"), applied, strict=True)))
+        for left in range(times if k else 1, 0, -1):
+            for queue in queues.values():
+                if len(queue) == left:
+                    one = queue.pop(0)
+                    measured = {key: value for key, (value, _) in one.values.items()}
+                    numbers = measured | {"time": one.time_s}
+                    slave.set({f"sensor_{one.instrument}_{key}": numbers[key] for key in numbers})
+            slave.time = k * STEP_S - (left - 1) * STEP_S / times  # not a sum of steps
+            slave.step(STEP_S / times)
+        rows.append(slave.get("d", "delta_rate", "status", "fallback_level"))
+    return np.array(rows)
+
+
+def test_a_car_that_instruments_measure_is_driven_as_in_lockstep(
+    exported: Exported, tmp_path: Path
+) -> None:
+    """By late poses, wheel speed and gyro at rates of their own, with gaps and outliers."""
+    run = exported.lockstep(sensors=odometry()).run(exported.circuit.start(v_mps=0.1), 250)
+    assert [level for _, level in run.said].count(Level.SOLUTION) > 100
+    car = exported.car.model_copy(update={"sensors": odometry()})
+    fmu = pack(exported.define(car=car), tmp_path / "seen.fmu")
+    assert validate_fmu(str(fmu)) == []
+    controller = exported.slave(fmu, {"d_applied_connected": 1.0})
+    assert "x" not in controller.references
+    same(seen(controller, run), run, tolerance=1e-12)
+    controller.reset()
+    with pytest.raises(FMICallException):
+        controller.initialise({"delay": STEP_S})
+    assert "connect d_applied and delta_rate_applied" in controller.messages[-1]
+    controller.reset()
+    controller.initialise({"d_applied_connected": 1.0})
+    same(seen(controller, run), run, tolerance=1e-12)
+    for k in range(200):  # more readings than a control step takes
+        names = ("sensor_pose_time", "sensor_wheel_time", "sensor_gyro_time")
+        controller.set(dict.fromkeys(names, controller.time + 1e-4 * k))
+        controller.step(0.001)
+        assert np.isfinite(controller.get("d", "delta_rate")).all()
+
+
+def test_instruments_whose_variables_would_have_one_name_are_refused(exported: Exported) -> None:
+    [pose] = mocap().root.values()
+    car = exported.car.model_copy(update={"sensors": Sensors({"a-b": pose, "a_b": pose})})
+    with pytest.raises(InputError, match="rename one of"):
+        exported.define(car=car)

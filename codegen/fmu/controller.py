@@ -15,6 +15,7 @@ from bayesrace.codegen.build import HOST
 from bayesrace.codegen.compiler import FLAGS
 from bayesrace.codegen.fmu.build import NATIVE, FmuDefinition, Variable
 from bayesrace.codegen.fmu.car import STATE
+from bayesrace.codegen.fmu.readings import reading_inputs, reading_tables
 from bayesrace.codegen.host_files import PATH_FILE, WEIGHTS_FILE, path_file, weights_file
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import GpWeights
@@ -63,7 +64,7 @@ _PLANNED: Final = (
 _STATUSES: Final = (
     "0 converged, 1 acceptable, 2 dynamics defect too large, 3 QP infeasible, "
     "4 QP iteration limit, 5 not finite, 6 bad state, 251 states contradict each other, "
-    "252 not predictable, 253 none yet, 255 refused"
+    "252 not predictable, 253 none yet, 254 position not known, 255 refused"
 )
 """br_mpc_status in controller/native/bayesrace_mpc.h and br_no_step in bayesrace_cycle.h. A step
 without a budget is never out of time."""
@@ -97,8 +98,8 @@ def controller_fmu(
         identifier="bayesrace_controller",
         description=f"GP-MPC racing controller for the car '{car.name}', {manifest.model} model",
         version=version,
-        variables=tuple(_variables(manifest, car.drive, settings, fallback)),
-        sources=_sources(artefact),
+        variables=tuple(_variables(manifest, car, settings, fallback)),
+        sources=_sources(artefact, car, nominal=weights is None),
         flags=FLAGS,
         constants={
             "NO_SPEED_LIMIT": _NO_LIMIT_MPS,
@@ -108,19 +109,20 @@ def controller_fmu(
             PATH_FILE: path_file(rows, spacing_m),
             WEIGHTS_FILE: weights_file(weights, manifest.discretisation, manifest.gp_capacity),
         },
-        documentation=_documentation(manifest, weights),
+        documentation=_documentation(manifest, car, weights),
         default_step_s=manifest.step_s,
         serialises=False,  # DAQP's workspace points into the same block of memory
     )
 
 
-def _sources(artefact: Path) -> dict[str, bytes]:
+def _sources(artefact: Path, car: CarParameters, *, nominal: bool) -> dict[str, bytes]:
     """Of the artefact all but its clock: without one there are no budgets; two runs are equal."""
     own = {*artefact.glob("*.[ch]"), *(artefact / HOST).iterdir()} - {artefact / "br_clock.c"}
     files = {path.name: path for path in (NATIVE / "controller.c", *own, *artefact.glob("*.a"))}
     files |= {f"daqp/{path.name}": path for path in (artefact / "daqp").iterdir()}
     planned = " ".join(f"X({name})" for name, *_ in _PLANNED)
-    made = {"controller_outputs.h": f"#define PLANNED(X) {planned}\n".encode()}
+    tables = reading_tables(car.sensors, car.tuning.estimator.named(nominal=nominal))
+    made = {"controller_tables.h": f"#define PLANNED(X) {planned}\n{tables}".encode()}
     return made | {name: path.read_bytes() for name, path in sorted(files.items())}
 
 
@@ -131,20 +133,25 @@ def _value(values: Mapping[str, float], name: str) -> float:
 
 
 def _variables(
-    manifest: Manifest, drive: Drive, settings: Mapping[str, float], fallback: Mapping[str, float]
+    manifest: Manifest,
+    car: CarParameters,
+    settings: Mapping[str, float],
+    fallback: Mapping[str, float],
 ) -> list[Variable]:
     """In the order that controller.c relies on: the state together, the outputs last."""
+    drive = car.drive
     acts = (
         f"{drive.command} that acts now, read if d_applied_connected; else taken to be the last "
         "output"
     )
     limit = f"the reference moves along the racing line no faster; {_NO_LIMIT_MPS:g}: no limit"
     rate = "by how much the limit falls along the horizon, for a stop on the line"
+    seen = list(reading_inputs(car.sensors)) or [
+        Variable(name, "input", f"measured: {text}", unit=unit, start=0.0)
+        for name, (unit, text) in STATE.items()
+    ]
     return [
-        *(
-            Variable(name, "input", f"measured: {text}", unit=unit, start=0.0)
-            for name, (unit, text) in STATE.items()
-        ),
+        *seen,
         Variable("d_applied", "input", acts, unit=drive.unit, start=0.0),
         Variable("speed_limit", "input", limit, unit="m/s", start=_NO_LIMIT_MPS),
         Variable("speed_limit_rate", "input", rate, unit="m/s2", start=0.0),
@@ -210,7 +217,14 @@ def _outputs(drive: Drive) -> list[Variable]:
     ]
 
 
-def _documentation(manifest: Manifest, weights: GpWeights | None) -> str:
+_READ: Final = """<p>The state is estimated of what instruments measure:
+<code>sensor_NAME_time</code> and their values. A reading is new if its time differs from the one
+before; every doStep takes one of each instrument. Connect what acts, <code>d_applied</code> and
+<code>delta_rate_applied</code>, and set <code>d_applied_connected</code>.</p>
+"""
+
+
+def _documentation(manifest: Manifest, car: CarParameters, weights: GpWeights | None) -> str:
     correction = "no correction" if weights is None else f"weights '{escape(weights.version)}'"
     return f"""<p>Nonlinear model predictive controller, {manifest.horizon} stages of
 {manifest.step_s:g} s, model {escape(manifest.discretisation)}, {correction}. On x86-64 the binary
@@ -220,6 +234,7 @@ are meant for the plant's step over the same time. So step the controller first,
 the plant, and step that; or, if your tool steps all FMUs side by side, set <code>delay</code> to
 the communication step. Without a usable solution, the outputs are those of the plan before it, then
 of braking along it (<code>fallback_level</code>). They are always finite.</p>
+{_READ if car.sensors.root else ""}
 <p>A tunable parameter outside its bounds is refused with the status Discard. Parameters that do not
 fit together, such as <code>d_min</code> above <code>d_max</code>, make the next control step return
 Warning, and all have the values of the step before again. The simulation may go on after both.</p>

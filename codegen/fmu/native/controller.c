@@ -11,7 +11,7 @@
 
 #include "bayesrace_cycle.h"
 #include "br_files.h"
-#include "controller_outputs.h" /* generated: PLANNED */
+#include "controller_tables.h" /* generated: PLANNED, and those of instruments */
 #include "fmu.h"
 
 #define ALIGNED(size) (((size) + 63) / 64 * 64)
@@ -22,7 +22,10 @@ typedef struct {
     br_cycle *cycle;
     double next_s; /* release of the next control step */
     int64_t cycles;
-    double used[FMU_VALUES]; /* by value reference: the parameters in use */
+    double used[FMU_VALUES];       /* by value reference: the parameters in use */
+    double read_s[BR_INSTRUMENTS]; /* times of the newest readings */
+    int readings;                  /* since the control step before: */
+    br_measurement reading[BR_MEASUREMENTS];
 } controller;
 
 size_t fmu_model_size(void) {
@@ -95,13 +98,19 @@ bool fmu_model_initialise(fmu_instance *instance) {
     controller *c = instance->model;
     double *v = instance->value;
     char *memory = (char *)c->mpc + ALIGNED(br_mpc_memory_size());
+    const br_estimation estimation = {ESTIMATION};
     br_cycle_drive_mpc(memory, br_cycle_memory_size(), c->mpc, 0, &c->cycle);
+    br_cycle_set_estimation(c->cycle, NULL, &estimation);
     br_mpc_reset(c->mpc);
     const br_mpc_error error = use_parameters(c, v);
     if (error) return fmu_refuse(instance, UNUSABLE, br_mpc_error_text(error));
+    if (INSTRUMENTS && v[FMU_V_delay] > 0 && !v[FMU_V_d_applied_connected])
+        return fmu_refuse(instance, "controller: with instruments and a delay, connect d_applied "
+                                    "and delta_rate_applied, and set d_applied_connected");
     memcpy(c->used, v, sizeof c->used);
     c->next_s = v[FMU_V_time];
-    c->cycles = 0;
+    c->cycles = c->readings = 0;
+    for (int i = 0; i < BR_INSTRUMENTS; ++i) c->read_s[i] = NOT_READ;
     memset(&v[FMU_V_d], 0, (FMU_V_time - FMU_V_d) * sizeof *v); /* the outputs */
     v[FMU_V_status] = BR_HALTED;
     v[FMU_V_fallback_level] = BR_STOP;
@@ -116,6 +125,33 @@ static bool due(controller *c, double time_s, double period_s) {
     if (period_s > 0) c->next_s += period_s * (floor((time_s + early - c->next_s) / period_s) + 1);
     return true;
 }
+
+#if INSTRUMENTS
+/* Keeps what is new of the readings until the next control step; the newest if they are too many.
+ */
+static void collect(controller *c, const double *v) {
+    static const struct {
+        int instrument, value, of;
+        double deviation, relative;
+    } channels[] = {CHANNELS};
+    static const int times[] = {TIMES};
+    for (int i = 0; i < INSTRUMENTS; ++i) {
+        br_measurement m = {.time_s = v[times[i]], .instrument = i};
+        if (m.time_s == c->read_s[i]) continue;
+        c->read_s[i] = m.time_s;
+        for (size_t k = 0; k < sizeof channels / sizeof *channels; ++k) {
+            if (channels[k].instrument != i) continue;
+            const double value = m.value[m.count] = v[channels[k].value];
+            m.of[m.count] = channels[k].of;
+            m.deviation[m.count++] =
+                fmax(channels[k].deviation, channels[k].relative * fabs(value));
+        }
+        if (c->readings == BR_MEASUREMENTS)
+            memmove(c->reading, c->reading + 1, --c->readings * sizeof *c->reading);
+        c->reading[c->readings++] = m;
+    }
+}
+#endif
 
 /* The inputs of the FMU as a received state. If the importer connects the input that acts and there
  * is no delay, nothing has to be predicted. Without a delay, the outputs of the last control step
@@ -135,7 +171,16 @@ static br_measured measured(fmu_instance *instance) {
     else if (at_once)
         state.u_applied[BR_INDEX_DUTY] = v[FMU_V_d];
     if (at_once) state.u_applied[BR_INDEX_DELTA_RATE] = v[FMU_V_delta_rate];
+#if INSTRUMENTS
+    if (connected) state.u_applied[BR_INDEX_DELTA_RATE] = v[FMU_V_delta_rate_applied];
+    state.averaged |= connected;
+    state.estimated = 1;
+    state.measurements = c->readings;
+    memcpy(state.measured, c->reading, sizeof state.measured);
+    c->readings = 0;
+#else
     memcpy(state.x, &v[FMU_V_x], sizeof state.x);
+#endif
     return state;
 }
 
@@ -167,6 +212,9 @@ static void set_outputs(fmu_instance *instance, const br_decision *decision) {
 fmu_status fmu_model_step(fmu_instance *instance, double h) {
     controller *c = instance->model;
     const double *v = instance->value;
+#if INSTRUMENTS
+    collect(c, v);
+#endif
     if (!due(c, v[FMU_V_time], v[FMU_V_period])) return FMU_OK;
     br_environment around = {v[FMU_V_speed_limit], v[FMU_V_speed_limit_rate]};
     if (around.speed_limit_mps >= NO_SPEED_LIMIT) around.speed_limit_mps = INFINITY;
