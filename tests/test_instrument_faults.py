@@ -248,10 +248,14 @@ def test_a_car_whose_states_are_measured_after_all_is_driven(race: Racing) -> No
     assert set(driven.levels[1:]) == {Level.SOLUTION}
 
 
-def test_a_car_that_rolls_at_any_speed_is_driven_after_two_poses(race: Racing) -> None:
+@pytest.mark.parametrize(("kit", "known_s"), [(mocap(ROUGH), 0.2), (odometry(), 0.5)])
+def test_a_car_that_rolls_at_any_speed_is_driven_after_some_poses(
+    race: Racing, kit: Sensors, known_s: float
+) -> None:
     for k, start in enumerate(race.moments(8)):
-        loop = Seen(race, mocap(ROUGH), seed=k)
+        loop = Seen(race, kit, seed=k)
         driven = loop.drive(0, max_time_s=1.5, x0=start)
-        assert race.off_track_m(driven.x) <= 0
-        assert set(driven.levels[10:]) == {Level.SOLUTION}
+        assert set(driven.levels[round(known_s / 0.02) :]) == {Level.SOLUTION}
         assert not any(who for *_, who, _ in loop.named)
+        if len(kit.root) == 1:  # rare poses come too late for a car at racing speed
+            assert race.off_track_m(driven.x) <= 0
