@@ -40,6 +40,9 @@ WALK = np.array([7, 7, 120])
 """Standard deviations of accelerations, which are estimated in place of the model ..."""
 FADING_S = 0.2
 """... with this time constant."""
+LAG_S, UNDERSTEER = 0.08, 0.008
+"""Of the yaw rate behind the steering angle."""
+WHEELBASE_M = get_car("orca").wheelbase_m
 VARIANCE = np.array([4e-6, 9e-6, 4e-3])
 TURN, SHIFT = 0.05, 0.01
 """Offsets of yaw rate and steering angle as measured."""
@@ -117,7 +120,9 @@ def model_speed(step: NativeStep, at: Floats, u: Floats, h: float) -> Callable[[
 def walked(x: Floats, u: Floats, h: float, speed: Callable[[Floats], Any]) -> Floats:
     """x (12,) with accelerations that are held; velocities are linear in time, and the position is
     by Simpson's rule."""
-    begin, end = x[3:6], np.r_[speed(x[:7]), x[4:6]] + h * x[9:]
+    begin, settled = x[3:6], x[3] * x[6] / (WHEELBASE_M + UNDERSTEER * x[3] ** 2)
+    yaw_rate = settled + (x[5] - settled) * np.exp(-h / LAG_S)
+    end = np.r_[speed(x[:7]), x[4], yaw_rate] + h * x[9:]
     yaw = x[2] + h * np.array([0, (3 * begin[2] + end[2]) / 8, (begin[2] + end[2]) / 2])
     rates = [
         (np.cos(psi) * vx - np.sin(psi) * vy, np.sin(psi) * vx + np.cos(psi) * vy)
@@ -209,6 +214,7 @@ def textbook(
 
 def settings(**changed: Any) -> dict[str, Any]:
     walk = {"acceleration": MODEL, "acceleration_s": FADING_S}
+    walk |= {"yaw_lag_s": LAG_S, "understeer": UNDERSTEER}
     values = {"start": START, "drift": DRIFT, "gate": 0.0} | walk | changed
     return {name: np.asarray(one).tolist() for name, one in values.items()}
 
@@ -347,7 +353,7 @@ def test_it_begins_with_a_pose_from_standstill_and_not_before(
 def test_steering_stays_what_it_was_where_it_begins_anew_without_the_model(
     kinematic_artefact: Path, car: CarParameters
 ) -> None:
-    """Nothing that is measured says where the wheels are; the first of two poses is an outlier."""
+    """Little says where the wheels are; the first of two poses is an outlier."""
     step = NativeStep(kinematic_artefact, car, SETTINGS)
     made, u = estimator(step, gate=1.0, acceleration=WALK), np.array([0.0, 1.0])
     for k in range(1, 8):
@@ -355,8 +361,8 @@ def test_steering_stays_what_it_was_where_it_begins_anew_without_the_model(
         made.advance(TS * k, u, VARIANCE, [of_pose(TS * k, np.array(pose))])
     found, turned = made.read(), 6 * TS
     assert found.x[3] == pytest.approx(2.0, abs=0.3)  # it has begun anew, and moves
-    assert found.x[6] == pytest.approx(turned, abs=1e-12)
-    assert found.covariance[6, 6] == pytest.approx(START[6] ** 2)
+    assert found.x[6] == pytest.approx(turned, abs=0.02)
+    assert 0.9 * START[6] ** 2 < found.covariance[6, 6] < 1.01 * START[6] ** 2
 
 
 @pytest.mark.parametrize(
@@ -367,6 +373,7 @@ def test_steering_stays_what_it_was_where_it_begins_anew_without_the_model(
         {"drift": DRIFT * np.nan},
         {"acceleration": -WALK},
         {"acceleration": WALK, "acceleration_s": 0.0},
+        {"acceleration": WALK, "yaw_lag_s": 0.0},
     ],
 )
 def test_unusable_settings_are_refused(make: Make, changes: dict[str, Any]) -> None:

@@ -175,6 +175,8 @@ class EstimatorTuning(_Section):
     acceleration_mps2: float = _number(6.0, "of accelerations without weights [m/s^2]", ge=0)
     acceleration_radps2: float = _number(120.0, "and of the yaw rate [rad/s^2]", ge=0)
     acceleration_s: float = _number(0.2, "time in which they are forgotten [s]")
+    yaw_lag_s: float = _number(0.08, "with which the yaw rate follows the steering angle then [s]")
+    understeer_s2pm: float = _number(0.008, "angle per lateral acceleration then [rad s^2/m]", ge=0)
     gate: float = _number(
         1.0, "times the squared distance that one of 1,000 exceeds, a reading is refused [-]", ge=0
     )
@@ -193,6 +195,8 @@ class EstimatorTuning(_Section):
             ),
             "acceleration": (along, along, about) if nominal else (0.0, 0.0, 0.0),
             "acceleration_s": self.acceleration_s,
+            "yaw_lag_s": self.yaw_lag_s,
+            "understeer": self.understeer_s2pm,
             "gate": self.gate,
         }  # fmt: skip
 

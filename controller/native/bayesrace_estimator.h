@@ -6,7 +6,8 @@
  * measured yaw rate (a gyro's) and of the measured steering angle. Where no weights correct the
  * model, accelerations may be estimated as well, as first-order Markov processes (Singer,
  * "Estimating optimal tracking filter performance for manned maneuvering targets", IEEE Trans. AES
- * 6, 1970): beside the model's along the car, and in place of its lateral motion and yaw.
+ * 6, 1970): beside the model's along the car, in place of its lateral motion, and beside a lag of
+ * the yaw rate in place of its yaw.
  *
  *   br_estimator_advance(estimator, time_s, u, variance, measurements, count);   each period
  *   br_estimator_read(estimator, &belief);
@@ -63,6 +64,8 @@ typedef struct {
     double acceleration[BR_NE]; /* standard deviations of these accelerations, around 0; all 0: the
                                  * model alone moves the car */
     double acceleration_s;      /* their time constant; above 0, unless there are none */
+    double yaw_lag_s;  /* with which the yaw rate then follows the steering angle, above 0; ... */
+    double understeer; /* ... what of the angle a lateral acceleration takes up [rad s^2/m] */
     double gate; /* a measurement is refused beyond so many times the squared distance that one of
                   * 1,000 exceeds (chi-squared); 0: none is */
 } br_estimation;

@@ -54,7 +54,10 @@ br_mpc_error br_estimator_set(br_estimator *estimator, const br_estimation *sett
         valid &= isfinite(settings->acceleration[j]) && settings->acceleration[j] >= 0;
         walks |= settings->acceleration[j] > 0;
     }
-    if (walks) valid &= isfinite(settings->acceleration_s) && settings->acceleration_s > 0;
+    if (walks)
+        valid &= isfinite(settings->acceleration_s) && settings->acceleration_s > 0 &&
+                 isfinite(settings->yaw_lag_s) && settings->yaw_lag_s > 0 &&
+                 isfinite(settings->understeer) && settings->understeer >= 0;
     if (!valid) return BR_ERROR_PARAMETERS;
     estimator->settings = *settings;
     estimator->walks = walks;
@@ -97,24 +100,42 @@ static void spread(const double jacobian[BR_NX * BR_NX],
     }
 }
 
+/* The yaw acceleration of a car that follows its steering angle, with a lag, as a car that
+ * understeers does in the end; and how it changes with the state. */
+static double steered(const br_estimation *s, const double x[BR_NX], double duration,
+                      double slope[BR_NX]) {
+    const double v = fmax(x[BR_INDEX_VX], 0), angle = x[BR_INDEX_DELTA];
+    const double base = BR_WHEELBASE_M + s->understeer * v * v;
+    const double share = (1 - exp(-duration / s->yaw_lag_s)) / duration;
+    memset(slope, 0, BR_NX * sizeof(double));
+    slope[BR_INDEX_VX] = share * angle * (BR_WHEELBASE_M - s->understeer * v * v) / (base * base);
+    slope[BR_INDEX_DELTA] = share * v / base;
+    slope[BR_INDEX_OMEGA] = -share;
+    return share * (v * angle / base - x[BR_INDEX_OMEGA]);
+}
+
 /* As br_mpc_propagate, where accelerations move the car: along it beside the model, which knows the
  * motor, else in its place, because by the model a wheel that is turned moves the car at once. */
-static br_mpc_error walk(const br_mpc *mpc, const br_estimate *b, const double u[BR_NU],
+static br_mpc_error walk(const br_estimator *estimator, const br_estimate *b, const double u[BR_NU],
                          double duration, double next[BR_NX], double f[BR_NX * BR_NX],
                          double by[BR_NX * BR_NE], double q[BR_NX * BR_NX]) {
-    double lacking[BR_NE];
+    double lacking[BR_NE], turning[BR_NX];
+    const br_mpc *mpc = estimator->mpc;
     const double *x = b->x, *acceleration = b->x + BR_NB;
     br_mpc_error error = br_mpc_propagate(mpc, x, x, u, duration, NULL, NULL, next, f, by, q);
     for (int j = 0; j < BR_NE; ++j) {
         lacking[j] = acceleration[j];
         if (RATE[j] != BR_INDEX_VX) lacking[j] += (x[RATE[j]] - next[RATE[j]]) / duration;
+        if (RATE[j] == BR_INDEX_OMEGA)
+            lacking[j] += steered(&estimator->settings, x, duration, turning);
     }
     if (!error) error = br_mpc_propagate(mpc, x, x, u, duration, NULL, lacking, next, f, by, q);
     if (error) return error;
     double changed[BR_NE][BR_NX] = {{0}}; /* of what is lacking, with x */
     for (int j = 0; j < BR_NE; ++j)
         for (int l = 0; RATE[j] != BR_INDEX_VX && l < BR_NX; ++l)
-            changed[j][l] = ((l == RATE[j]) - f[BR_NX * RATE[j] + l]) / duration;
+            changed[j][l] = ((l == RATE[j]) - f[BR_NX * RATE[j] + l]) / duration +
+                            (RATE[j] == BR_INDEX_OMEGA ? turning[l] : 0);
     for (int i = 0; i < BR_NX; ++i)
         for (int l = 0; l < BR_NX; ++l)
             for (int j = 0; j < BR_NE; ++j) f[BR_NX * i + l] += by[BR_NE * i + j] * changed[j][l];
@@ -139,7 +160,7 @@ static br_mpc_error propagate(const br_estimator *estimator, const double u[BR_N
     double f[BR_NX * BR_NX], by[BR_NX * BR_NE], q[BR_NX * BR_NX], begin[BR_NX], next[BR_NX];
     for (int i = 0; i < BR_NX; ++i) begin[i] = b->x[i] - b->way[i];
     const br_mpc_error error = estimator->walks
-                                   ? walk(estimator->mpc, b, u, duration, next, f, by, q)
+                                   ? walk(estimator, b, u, duration, next, f, by, q)
                                    : br_mpc_propagate(estimator->mpc, b->x, begin, u, duration,
                                                       variance, NULL, next, f, by, q);
     if (error) return error;
@@ -333,7 +354,7 @@ static void begin_moving(const br_measurement *before, const br_measurement *m, 
     b->p[BR_INDEX_DELTA][BR_INDEX_DELTA] *= STEERED * STEERED;
 }
 
-/* Where no model relates it to what is measured, the steering angle is still what it was. */
+/* Where little relates it to what is measured, the steering angle is still what it was. */
 static void keep_steering(const br_estimate *known, br_estimate *b) {
     const int of[] = {BR_INDEX_DELTA, BR_NX + 1}; /* with the offset of what measures it */
     for (int i = 0; i < 2; ++i) {
