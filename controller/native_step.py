@@ -243,20 +243,23 @@ class NativeProblem:
         self._check(self._quick.br_mpc_revert_weights(self._address), "weights")
         self.weights_version = self._proven_version
 
-    def watch(self) -> Any:
+    def watch(self, resolution: Floats) -> Any:
         """How the weights in use do beside the proven ones, a br_mpc_watch; overwritten by the
-        next."""
-        self._quick.br_mpc_get_watch(self._address, self._watch_address)
+        next. ``resolution`` (ne,), contiguous: errors per stage that do not count."""
+        given = ctypes.c_void_p(resolution.ctypes.data)
+        self._quick.br_mpc_get_watch(self._address, given, self._watch_address)
         return self._watch
 
-    def samples(self) -> tuple[Floats, Floats]:
-        """The newest samples of what the car has done, by the thread that steps: features (n, nz)
-        and residuals of the model without correction (n, ne), per stage."""
+    def samples(self) -> tuple[Floats, Floats, Floats]:
+        """The newest samples of what the car has done, by the thread that steps: features (n, nz),
+        residuals of the model without correction (n, ne), per stage, and the variances (n, ne) of
+        these by what is estimated."""
         problem, count = self.manifest.problem, self._ffi.new("int *")
-        features, z = self._made(self._library.BR_SAMPLES, len(problem.features))
-        residuals, e = self._made(self._library.BR_SAMPLES, problem.outputs)
-        self._check(self._library.br_mpc_get_samples(self.handle, z, e, count), "samples")
-        return features[: count[0]], residuals[: count[0]]
+        widths, most = (len(problem.features), *[problem.outputs] * 2), self._library.BR_SAMPLES
+        rows, given = zip(*(self._made(most, width) for width in widths), strict=True)
+        self._check(self._library.br_mpc_get_samples(self.handle, *given, count), "samples")
+        features, residuals, noise = (one[: count[0]] for one in rows)
+        return features, residuals, noise
 
     def reset(self) -> None:
         """Forgets plan, working set and place on the line."""
@@ -322,13 +325,15 @@ class NativeProblem:
         """What the car did between two measured states (nx,), under u (nu,) on average.
 
         Where such errors are larger than the posterior's standard deviations, caution widens these.
-        ``noise`` (nx,): variances of what an estimate differs by where the model is right.
-        InputError for a duration that is not above 0 and at most 1, or numbers
-        that are not finite.
+        ``noise`` (2, nx), where the states are estimates: the variances in br_mpc_noise.
+        InputError for a duration that is not above 0 and at most 1, or numbers that are not finite.
         """
         given = self._given("x", x, self._nx), self._given("u", u, self._nu)
         after = self._given("x_next", x_next, self._nx)
-        variances = self._ffi.NULL if noise is None else self._given("noise", noise, self._nx)
+        variances = self._ffi.NULL
+        if noise is not None:
+            given_noise = self._given("noise", noise, 2, self._nx)
+            variances = self._ffi.cast("br_mpc_noise *", given_noise)
         error = self._library.br_mpc_observe(self.handle, *given, duration_s, after, variances)
         self._check(error, "observe")
 

@@ -165,7 +165,9 @@ class GateSettings(BaseModel):
 
         error_new > worse_factor * error_old + worse_share * error_nominal + resolution * Ts * few
 
-    with RMSEs over the same samples and ``nominal`` the model without correction. ``resolution``
+    with RMSEs over the same samples and ``nominal`` the model without correction. Where states are
+    estimated, RMSEs are what is left of the errors beyond the noise: each square less the variance
+    of the estimated step, weighted by 1 / (1 + variance / (resolution * Ts)^2). ``resolution``
     and the bound on corrections depend on the car: :class:`bayesrace.vehicles.tuning.GateTuning`.
     ``few`` is 100, the samples that the watch compares on, over the number of samples, and at
     least 1: a handful of samples, as after a standing start, must be far worse.

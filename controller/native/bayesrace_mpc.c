@@ -123,7 +123,7 @@ void br_mpc_reset(br_mpc *mpc) {
 
 br_mpc_error br_mpc_observe(br_mpc *mpc, const double x[BR_NX], const double u[BR_NU],
                             double duration_s, const double x_next[BR_NX],
-                            const double noise[BR_NX]) {
+                            const br_mpc_noise *noise) {
     if (!mpc || !x || !u || !x_next) return BR_ERROR_NULL;
     if (!(duration_s > 0 && duration_s <= BR_PREDICT_MAX_S)) return BR_ERROR_TIME;
     if (!br_plausible_state(x) || !br_plausible_state(x_next) ||
@@ -134,7 +134,7 @@ br_mpc_error br_mpc_observe(br_mpc *mpc, const double x[BR_NX], const double u[B
     memcpy(newest->x, x, sizeof newest->x);
     memcpy(newest->u, u, sizeof newest->u);
     memcpy(newest->x_next, x_next, sizeof newest->x_next);
-    for (int i = 0; i < BR_NX; ++i) newest->noise[i] = noise ? noise[i] : 0;
+    newest->noise = noise ? *noise : (br_mpc_noise){{0}, {0}};
     mpc->watch.newest = *newest;
     return BR_OK;
 }
@@ -295,9 +295,11 @@ br_mpc_error br_mpc_revert_weights(br_mpc *mpc) {
 
 /* --- what the car has shown --- */
 
-br_mpc_error br_mpc_get_watch(const br_mpc *mpc, br_mpc_watch *out) {
-    if (!mpc || !out) return BR_ERROR_NULL;
+br_mpc_error br_mpc_get_watch(const br_mpc *mpc, const double resolution[BR_NE],
+                              br_mpc_watch *out) {
+    if (!mpc || !resolution || !out) return BR_ERROR_NULL;
     const br_watch *watch = &mpc->watch;
+    double weights[BR_NE] = {0};
     memset(out, 0, sizeof *out);
     out->fresh = (double)(watch->count - watch->since);
     for (int64_t k = watch->count - 1; k >= 0 && k >= watch->count - BR_WATCHED; --k) {
@@ -306,28 +308,34 @@ br_mpc_error br_mpc_get_watch(const br_mpc *mpc, br_mpc_watch *out) {
         if (judged->number != k + 1) continue;
         out->samples += 1;
         for (int j = 0; j < BR_NE; ++j) {
-            out->in_use[j] += judged->error[0][j] * judged->error[0][j];
-            out->proven[j] += judged->error[1][j] * judged->error[1][j];
-            out->nominal[j] += sample->residual[j] * sample->residual[j];
+            const double noise = sample->noise[j], in_use = judged->error[0][j];
+            const double proven = judged->error[1][j], nominal = sample->residual[j];
+            const double weight = 1 / (1 + noise / (resolution[j] * resolution[j]));
+            weights[j] += weight;
+            out->in_use[j] += weight * (in_use * in_use - noise);
+            out->proven[j] += weight * (proven * proven - noise);
+            out->nominal[j] += weight * (nominal * nominal - noise);
         }
     }
     for (int j = 0; j < BR_NE && out->samples; ++j) {
-        out->in_use[j] = sqrt(out->in_use[j] / out->samples);
-        out->proven[j] = sqrt(out->proven[j] / out->samples);
-        out->nominal[j] = sqrt(out->nominal[j] / out->samples);
+        out->in_use[j] = sqrt(fmax(out->in_use[j] / weights[j], 0));
+        out->proven[j] = sqrt(fmax(out->proven[j] / weights[j], 0));
+        out->nominal[j] = sqrt(fmax(out->nominal[j] / weights[j], 0));
     }
     return BR_OK;
 }
 
 br_mpc_error br_mpc_get_samples(const br_mpc *mpc, double features[BR_SAMPLES * BR_NZ],
-                                double residuals[BR_SAMPLES * BR_NE], int *count) {
-    if (!mpc || !features || !residuals || !count) return BR_ERROR_NULL;
+                                double residuals[BR_SAMPLES * BR_NE],
+                                double noise[BR_SAMPLES * BR_NE], int *count) {
+    if (!mpc || !features || !residuals || !noise || !count) return BR_ERROR_NULL;
     const br_watch *watch = &mpc->watch;
     *count = (int)(watch->count < BR_SAMPLES ? watch->count : BR_SAMPLES);
     for (int i = 0; i < *count; ++i) {
         const br_sample *sample = &watch->sample[(watch->count - *count + i) % BR_SAMPLES];
         memcpy(features + i * BR_NZ, sample->z, sizeof sample->z);
         memcpy(residuals + i * BR_NE, sample->residual, sizeof sample->residual);
+        memcpy(noise + i * BR_NE, sample->noise, sizeof sample->noise);
     }
     return BR_OK;
 }

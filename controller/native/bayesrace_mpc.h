@@ -146,7 +146,14 @@ typedef struct {
  * weights are compared while they are watched. */
 enum { BR_SAMPLES = 512, BR_WATCHED = 100 };
 
-/* How the weights in use do beside others: root mean square errors per stage. */
+/* Variances where the states before and after a step are estimates. */
+typedef struct {
+    double corrected[BR_NX]; /* of x_next from its prediction, where the model is right */
+    double step[BR_NX];      /* of the estimated step from the car's, whatever the model */
+} br_mpc_noise;
+
+/* How the weights in use do beside others: root mean square errors per stage, beyond what the
+ * noise of estimates explains. */
 typedef struct {
     int samples;           /* of the newest, judged so far */
     double fresh;          /* samples since the weights in use were adopted */
@@ -208,16 +215,23 @@ BR_API br_mpc_error br_mpc_adopt_weights(br_mpc *mpc);
 /* Weights that have been adopted are on probation, and what was proven before them is kept.
  * br_mpc_get_watch, between two calls: the errors of both, and of none, on the newest samples of
  * what the car did, as br_mpc_observe has been shown it; they are judged in br_mpc_prepare.
+ * resolution: errors per stage that do not count, above 0; a sample whose residual has a variance v
+ * by the noise of estimates has the weight 1 / (1 + v / resolution^2).
  * br_mpc_prove_weights ends the probation, br_mpc_revert_weights goes back to what is proven, as
- * fast as an adoption. What br_mpc_set_weights has loaded counts as proven.
+ * fast as an adoption. What br_mpc_set_weights has loaded counts as proven. Until the probation
+ * ends states are estimated (br_mpc_propagate, br_mpc_variance) by the proven weights, if these
+ * correct anything: wrong ones would make estimates that agree with them.
  *
- * br_mpc_get_samples copies the newest BR_SAMPLES samples, the oldest first: features, and the
- * residual per stage that the weights are to explain. All by the thread that steps. */
-BR_API br_mpc_error br_mpc_get_watch(const br_mpc *mpc, br_mpc_watch *watch);
+ * br_mpc_get_samples copies the newest BR_SAMPLES samples, the oldest first: features, the residual
+ * per stage that the weights are to explain, and its variance by the noise of estimates. All by the
+ * thread that steps. */
+BR_API br_mpc_error br_mpc_get_watch(const br_mpc *mpc, const double resolution[BR_NE],
+                                     br_mpc_watch *watch);
 BR_API br_mpc_error br_mpc_prove_weights(br_mpc *mpc);
 BR_API br_mpc_error br_mpc_revert_weights(br_mpc *mpc);
 BR_API br_mpc_error br_mpc_get_samples(const br_mpc *mpc, double features[BR_SAMPLES * BR_NZ],
-                                       double residuals[BR_SAMPLES * BR_NE], int *count);
+                                       double residuals[BR_SAMPLES * BR_NE],
+                                       double noise[BR_SAMPLES * BR_NE], int *count);
 
 /* The clock that budgets are measured with, NULL for none (then there are no budgets). It is read
  * from within br_mpc_step, br_mpc_solve and br_mpc_prepare only, in their thread. */
@@ -274,14 +288,13 @@ BR_API br_mpc_error br_mpc_solve(br_mpc *mpc, const double x[BR_NX], const doubl
  * caution widens them from the step after the next on (info->widening), until br_mpc_reset or other
  * weights. For consecutive states of a car that moves, about a stage apart, by the thread that
  * steps; the newest before a step counts. Never needed; without caution it changes nothing.
- * noise: variances of what x_next differs by from the prediction where the model is right, as an
- * estimator has them; NULL: the states are exact.
+ * noise: as an estimator has it; NULL: the states are exact.
  * BR_ERROR_TIME for a duration that is not above 0 and at most BR_PREDICT_MAX_S, BR_ERROR_STATE as
  * for br_mpc_predict.
  */
 BR_API br_mpc_error br_mpc_observe(br_mpc *mpc, const double x[BR_NX], const double u[BR_NU],
                                    double duration_s, const double x_next[BR_NX],
-                                   const double noise[BR_NX]);
+                                   const br_mpc_noise *noise);
 
 /* The state of the next step is an estimate with this covariance, row by row. The tube of the step
  * after it begins with that, which hardly changes from step to step, so that it can be made in the
@@ -310,7 +323,7 @@ BR_API br_mpc_error br_mpc_predict(const br_mpc *mpc, const double x[BR_NX], con
  * residual's variance (per stage; NULL: 0) adds, whose errors are taken to be independent from one
  * stage to the next. begin: the state at which the stage has begun, whose residual counts in all
  * its parts, because it is learned as that of a whole stage; NULL: x. disturbance: a rate of change
- * beside the residual [unit/s]; NULL: 0. */
+ * beside the residual [unit/s]; NULL: 0. By the proven weights, if they correct anything. */
 BR_API br_mpc_error br_mpc_propagate(const br_mpc *mpc, const double x[BR_NX],
                                      const double begin[BR_NX], const double u[BR_NU],
                                      double duration_s, const double variance[BR_NE],
@@ -350,7 +363,8 @@ BR_API br_mpc_error br_mpc_get_tube(const br_mpc *mpc, double tube[BR_N]);
 BR_API br_mpc_error br_mpc_set_instructions(br_mpc *mpc, br_instructions instructions);
 BR_API br_instructions br_mpc_get_instructions(const br_mpc *mpc);
 
-/* Posterior variance of the residual at v = [x; u], noise included; 0 where it is not known. */
+/* Posterior variance of the residual at v = [x; u], noise included; 0 where it is not known. By the
+ * proven weights, if they correct anything. */
 BR_API br_mpc_error br_mpc_variance(br_mpc *mpc, const double v[BR_NV], double variance[BR_NE]);
 
 /* Corrected model at v = [x; u]: x_next, J = d x_next / d v (row major) and

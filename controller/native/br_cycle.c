@@ -220,8 +220,39 @@ static void foresee(br_cycle *cycle) {
     cycle->has_variance = br_mpc_variance(cycle->mpc, v, cycle->variance) == BR_OK;
 }
 
-/* What counts of the newest state where it is estimated; its variances by the one before. */
-static const double *estimate(br_cycle *cycle, const br_measured *before) {
+/* Of the step from the estimate before to this one. The car's own step differs from the model's by
+ * q, of which the correction shows the share corrected / predicted: with e the error of an
+ * estimate,
+ *
+ *   var(e - f e_before) = corrected + q - 2 q corrected / predicted,
+ *
+ * each state taken by itself. Where measurements say little that is more than is corrected: what
+ * they have not shown of the car's step is no error of whatever weights. Without weights q is what
+ * is not known of the acceleration. */
+static br_mpc_noise noise_of(const br_cycle *cycle, const br_estimate *now, double duration_s) {
+    static const int corrects[BR_NE] = {BR_INDEX_VX, BR_INDEX_VY, BR_INDEX_OMEGA};
+    const br_estimator *estimator = &cycle->estimator;
+    br_mpc_noise noise;
+    double added[BR_NX];
+    for (int i = 0; i < BR_NX; ++i)
+        added[i] = duration_s * estimator->settings.drift[i] * estimator->settings.drift[i];
+    for (int j = 0; j < BR_NE; ++j) {
+        if (estimator->walks)
+            added[corrects[j]] += duration_s * duration_s * now->p[BR_NB + j][BR_NB + j];
+        else if (cycle->has_variance)
+            added[corrects[j]] += duration_s / BR_TS * cycle->variance[j];
+    }
+    for (int i = 0; i < BR_NX; ++i) {
+        const double corrected = estimator->corrected[i], predicted = now->p[i][i] + corrected;
+        const double shown = predicted > 0 ? corrected / predicted : 0;
+        noise.corrected[i] = corrected;
+        noise.step[i] = fmax(corrected + added[i] * (1 - 2 * shown), 0);
+    }
+    return noise;
+}
+
+/* What counts of the newest state where it is estimated; whether there is an estimate. */
+static int estimate(br_cycle *cycle, const br_measured *before, br_mpc_noise *noise) {
     br_measured *newest = &cycle->stream.newest;
     static const double none[BR_NX] = {0};
     const int begins = cycle->unknown, given = newest->measurements;
@@ -233,17 +264,18 @@ static const double *estimate(br_cycle *cycle, const br_measured *before) {
         br_estimator_advance(estimator, newest->time_s, newest->u_applied,
                              cycle->has_variance ? cycle->variance : NULL, newest->measured, most);
     cycle->unknown = error != BR_OK || estimator->astray;
-    cycle->has_variance = 0;
     cycle->doubt = BR_FAULT_NONE;
     if (!error) {
         const br_estimate *now = br_estimator_now(estimator);
+        *noise = noise_of(cycle, now, newest->time_s - before->time_s);
         memcpy(newest->x, now->x, sizeof newest->x);
         cycle->doubt = doubtful(cycle, now);
         if (!cycle->doubt || begins) cycle->monitor.trusted_s = newest->time_s;
         cycle->monitor.measured_s = newest->time_s;
     }
+    cycle->has_variance = 0;
     report(cycle);
-    return error ? NULL : estimator->corrected;
+    return !error;
 }
 
 br_reception br_cycle_observe(br_cycle *cycle, const br_measured *state) {
@@ -273,9 +305,10 @@ br_reception br_cycle_observe(br_cycle *cycle, const br_measured *state) {
     }
     const br_fault doubted = cycle->doubt;
     const int unknown = cycle->unknown;
-    const double *noise = NULL;
+    br_mpc_noise noise;
+    int estimated = 0;
     if (state->estimated) {
-        noise = estimate(cycle, &before);
+        estimated = estimate(cycle, &before, &noise);
     } else {
         cycle->unknown = 0;
         believe(cycle, interval_s);
@@ -286,7 +319,7 @@ br_reception br_cycle_observe(br_cycle *cycle, const br_measured *state) {
         cycle->shown.duration_s = 0;
     else if (!begins)
         br_shown_observe(&cycle->shown, cycle->mpc, &cycle->settings, &before,
-                         &cycle->stream.newest, noise);
+                         &cycle->stream.newest, estimated ? &noise : NULL);
     br_delay_observe(&cycle->delay, &cycle->settings, state, &cycle->counters.delay_s);
     return BR_STATE_NEW;
 }

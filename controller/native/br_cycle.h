@@ -23,14 +23,14 @@ int br_stream_forget(br_stream *stream, br_counters *counters);
 
 typedef struct {
     double duration_s, x[BR_NX], u[BR_NU]; /* since a measured state; 0: nothing yet; mean input */
-    double noise[BR_NX];                   /* see br_mpc_observe */
+    br_mpc_noise noise;                    /* all 0: of exact states */
 } br_shown;
 
-/* mpc NULL: another controller, which is shown nothing. noise: of the state given the one before;
- * NULL: it is exact. */
+/* mpc NULL: another controller, which is shown nothing. noise: of the step between the two states;
+ * NULL: they are exact. */
 void br_shown_observe(br_shown *shown, br_mpc *mpc, const br_driving *settings,
                       const br_measured *before, const br_measured *state,
-                      const double noise[BR_NX]);
+                      const br_mpc_noise *noise);
 
 /* --- br_state.c: the state at the moment from which the new input will act --- */
 

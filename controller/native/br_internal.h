@@ -110,12 +110,12 @@ typedef struct {
 typedef struct {
     double duration; /* 0: there is none */
     double x[BR_NX], u[BR_NU], x_next[BR_NX];
-    double noise[BR_NX]; /* variances of x_next, by what is estimated */
+    br_mpc_noise noise;
 } br_transition;
 
 /* What a residual learns from, and the errors on it: see br_watch.c. */
 typedef struct {
-    double z[BR_NZ], residual[BR_NE];
+    double z[BR_NZ], residual[BR_NE], noise[BR_NE]; /* noise: variances of the residual */
 } br_sample;
 
 typedef struct {

@@ -208,6 +208,14 @@ br_mpc_error br_predict_by(const br_mpc *mpc, const br_gp *gp, const double x[BR
     return BR_OK;
 }
 
+/* The weights by which states are estimated: the proven ones, if they correct anything, also while
+ * new ones are watched. A filter takes part of its model's error for the car's motion, so estimates
+ * by the new weights would agree with them. */
+static const br_gp *believed(const br_mpc *mpc) {
+    const br_gp *proven = &mpc->gp[mpc->gp_proven];
+    return proven->any ? proven : &mpc->gp[mpc->gp_in_use];
+}
+
 br_mpc_error br_propagate(const br_mpc *mpc, const double x[BR_NX], const double begin[BR_NX],
                           const double u[BR_NU], double duration_s, const double variance[BR_NE],
                           const double disturbance[BR_NE], double x_next[BR_NX],
@@ -218,7 +226,7 @@ br_mpc_error br_propagate(const br_mpc *mpc, const double x[BR_NX], const double
     if (!(duration_s > 0 && duration_s <= BR_TS * (1 + PART_MIN))) return BR_ERROR_TIME;
     if (!br_plausible_state(x) || !br_all_finite(u, BR_NU)) return BR_ERROR_STATE;
     const double *theta = br_theta(&mpc->parameters), share = duration_s / BR_TS;
-    const br_gp *gp = &mpc->gp[mpc->gp_in_use];
+    const br_gp *gp = believed(mpc);
     double acting[BR_NU], mean[BR_NE], unlimited[BR_NX], in_w[BR_NX][BR_NX + BR_NE];
     double z[1][BR_NZ];
     BR_ALIGNED br_gp_row kernels[BR_NE * BR_GP_BLOCKS];
@@ -256,7 +264,7 @@ br_mpc_error br_variance(br_mpc *mpc, const double v[BR_NV], double variance[BR_
     double x[1][BR_NX], u[1][BR_NU], found[1][BR_NE];
     memcpy(x, v, sizeof x);
     memcpy(u, v + BR_NX, sizeof u);
-    br_stages_variances(&mpc->gp[mpc->gp_in_use], 1, x, u, mpc->caution.correlations, found);
+    br_stages_variances(believed(mpc), 1, x, u, mpc->caution.correlations, found);
     memcpy(variance, found, sizeof found);
     return BR_OK;
 }

@@ -324,7 +324,7 @@ const char *br_cycle_fault_text(br_fault fault) {
  * standing car shows nothing. */
 void br_shown_observe(br_shown *shown, br_mpc *mpc, const br_driving *settings,
                       const br_measured *before, const br_measured *state,
-                      const double noise[BR_NX]) {
+                      const br_mpc_noise *noise) {
     const double step_s = state->time_s - before->time_s;
     const int next = (uint64_t)state->seq == (uint64_t)before->seq + 1;
     if (!mpc || !next || !state->averaged || !(step_s > 0)) {
@@ -334,18 +334,22 @@ void br_shown_observe(br_shown *shown, br_mpc *mpc, const br_driving *settings,
     if (shown->duration_s == 0) {
         memcpy(shown->x, before->x, sizeof shown->x);
         memset(shown->u, 0, sizeof shown->u);
-        memset(shown->noise, 0, sizeof shown->noise);
+        shown->noise = (br_mpc_noise){{0}, {0}};
     }
     const double duration_s = shown->duration_s + step_s;
     for (int i = 0; i < BR_NU; ++i)
         shown->u[i] += (state->u_applied[i] - shown->u[i]) * step_s / duration_s;
-    for (int i = 0; noise && i < BR_NX; ++i) shown->noise[i] += noise[i];
+    for (int i = 0; noise && i < BR_NX; ++i) {
+        shown->noise.corrected[i] += noise->corrected[i];
+        shown->noise.step[i] += noise->step[i];
+    }
     shown->duration_s = duration_s;
     if (duration_s < LEAST_STAGES * BR_TS) return;
     shown->duration_s = 0;
     if (duration_s <= MOST_STAGES * BR_TS && fabs(shown->x[BR_INDEX_VX]) > settings->standing_mps) {
         const int stage = fabs(duration_s - BR_TS) < STAGE_ROUNDING * BR_TS;
-        br_mpc_observe(mpc, shown->x, shown->u, stage ? BR_TS : duration_s, state->x, shown->noise);
+        br_mpc_observe(mpc, shown->x, shown->u, stage ? BR_TS : duration_s, state->x,
+                       &shown->noise);
     }
 }
 

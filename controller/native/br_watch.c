@@ -72,7 +72,7 @@ void br_innovation_judge(br_mpc *mpc, const double variance[BR_NE]) {
         const double share = fabs(mpc->stage[0].in_e[i][j]) * stages;
         if (!(share > 0 && variance[j] > 0)) continue; /* nothing is known of this output */
         const double error = fabs(due->x_next[i] - predicted[i]) / share;
-        const double expected = fmax(variance[j], due->noise[i] / (share * share));
+        const double expected = fmax(variance[j], due->noise.corrected[i] / (share * share));
         const double sigmas = fmin(error / sqrt(expected), LARGEST);
         misfit->recent[j] += fmin(stages / RECENT, 1) * (sigmas - misfit->recent[j]);
         misfit->held[j] = fmax(misfit->recent[j], misfit->held[j] * fmax(1 - stages / HELD, 0));
@@ -85,7 +85,10 @@ void br_innovation_judge(br_mpc *mpc, const double variance[BR_NE]) {
  * A sample is what a Gaussian process learns from: features, and the residual of the nominal model,
  * per stage. The preparation makes it of the newest transition given to br_mpc_observe, and
  * compares the weights on it: on the newest sample first, then on older ones, also from before the
- * weights came into use; on a few at a time, so that it takes some microseconds at most. */
+ * weights came into use; on a few at a time, so that it takes some microseconds at most. Where
+ * states are estimated, a residual has the variance by which the estimated step differs from the
+ * car's; br_mpc_get_watch takes it off the square of the error, and a sample counts less the larger
+ * it is beside the errors that do not count. */
 
 #define AT_ONCE 4   /* samples that one preparation judges */
 #define NEAR_BY 0.5 /* of a stage by which a sample's duration may differ from it */
@@ -102,6 +105,7 @@ static int sample_of(const br_mpc *mpc, const br_transition *seen, br_sample *sa
         const double share = mpc->stage[0].in_e[i][j] * stages;
         if (share == 0) return 0; /* before the first linearisation */
         sample->residual[j] = (seen->x_next[i] - nominal[i]) / share;
+        sample->noise[j] = seen->noise.step[i] / (share * share);
     }
     return br_all_finite(sample->residual, BR_NE);
 }

@@ -69,7 +69,7 @@ class Watch:
     """Looks between two cycles at what the compiled controller has found; see br_mpc_get_watch."""
 
     def __init__(self, settings: GateSettings, car: CarParameters, step_s: float) -> None:
-        self._settings, self._slack = settings, slack_of(car, step_s)
+        self._settings, self.resolution = settings, slack_of(car, step_s)
         self._needed = settings.watch_s / step_s
         self._driven = self._judged = 0.0
         self._cycles = self._fallen_back = 0
@@ -110,12 +110,12 @@ class Watch:
             return None
         errors = list(found.in_use), list(found.proven), list(found.nominal)
         new, proven, nominal = errors
-        one = compare(settings, self._slack, found.samples, new, proven, nominal)
+        one = compare(settings, self.resolution, found.samples, new, proven, nominal)
         if not one.worse:
             done = self._driven >= self._needed and not slowed
             return Ruling("proven", "", {}) if done else None
         data = self.data | one.data
-        others = compare(settings, self._slack, found.samples, proven, new, nominal).worse
+        others = compare(settings, self.resolution, found.samples, proven, new, nominal).worse
         if not others:
             return Ruling("back", f"predicted {one.worse} worse: {one.text}", data)
         if slowed:
@@ -164,7 +164,7 @@ class Adoption:
     def between_cycles(self, cycle: int) -> None:
         """Acts on what the watch finds, then on the task; ``cycle``: number of the next."""
         if self._watch is not None:
-            ruling = self._watch.look(self._step.watch())
+            ruling = self._watch.look(self._step.watch(self._watch.resolution))
             if ruling is not None:
                 self._rule(ruling)
                 self.done.append((cycle, ruling))

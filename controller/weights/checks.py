@@ -47,13 +47,15 @@ _LARGEST: Final = 1e12
 
 
 class Samples(NamedTuple):
-    """What the car did: features (n, 6), and the residuals (n, 3) of the nominal model."""
+    """What the car did: features (n, 6), the residuals (n, 3) of the nominal model, and the
+    variances (n, 3) of these where states are estimated, else 0."""
 
     features: Floats
     residuals: Floats
+    noise: Floats
 
 
-NO_SAMPLES: Final = Samples(np.zeros((0, 6)), np.zeros((0, 3)))
+NO_SAMPLES: Final = Samples(np.zeros((0, 6)), *np.zeros((2, 0, 3)))
 
 
 def plausible_features(car: CarParameters, count: int) -> Floats:
@@ -193,7 +195,9 @@ class Checks:
         """The weights must predict the samples that they were learned from."""
         if not len(weights.sample_features):
             return
-        samples = Samples(weights.sample_features, weights.sample_residuals)
+        # What smoothing has left unknown of these is small beside their residuals.
+        exact = np.zeros_like(weights.sample_residuals)
+        samples = Samples(weights.sample_features, weights.sample_residuals, exact)
         errors, without = self._errors(weights, samples), _rms(samples.residuals)
         # A posterior mean fits its own samples: neither do errors grow, nor are they one-sided.
         better = _rms(errors) <= without + self._slack
@@ -214,10 +218,14 @@ class Checks:
     ) -> str:
         """What speaks for the weights, on recent samples; InputError if they are worse."""
         usable = np.isfinite(self._errors(None, recent)).all(axis=1)
-        rmse, *before = (_rms(self._errors(one, recent)[usable]) for one in (new, *others))
+
+        def rms(errors: Floats) -> Floats:
+            return _rms(errors[usable], recent.noise[usable], self._slack)
+
+        rmse, *before = (rms(self._errors(one, recent)) for one in (new, *others))
         found = compare(
             self._settings, self._slack, int(usable.sum()), rmse, np.min(before, axis=0),
-            _rms(recent.residuals[usable]),
+            rms(recent.residuals),
         )  # fmt: skip
         facts |= found.data
         if found.worse:
@@ -232,9 +240,15 @@ def _decoded(data: bytes) -> GpWeights | None:
     return decode_weights(data) if data else None
 
 
-def _rms(errors: Floats) -> Floats:
-    """Of each column; 0 without rows."""
-    squares: Floats = np.sqrt((errors**2).sum(axis=0) / max(len(errors), 1))
+def _rms(errors: Floats, noise: Floats | float = 0.0, resolution: Floats | float = 1.0) -> Floats:
+    """Of each column, beyond what noise of these variances (n, 3) explains; 0 without rows.
+
+    A sample counts less, the larger its noise beside the ``resolution`` (3,). The same as
+    br_mpc_get_watch.
+    """
+    weights = 1 / (1 + np.broadcast_to(noise, errors.shape) / np.square(resolution))
+    beyond = (weights * (errors**2 - noise)).sum(axis=0)
+    squares: Floats = np.sqrt(np.maximum(beyond, 0) / np.maximum(weights.sum(axis=0), 1e-30))
     return squares
 
 
@@ -288,9 +302,9 @@ def compare(
 def judged(question: Mapping[str, Any], until_s: float) -> Any:
     """The fields of a :class:`Verdict` on the question, from another process.
 
-    ``question``: artefact and car (texts), settings (JSON), features and residuals of the recent
-    samples (bytes), the files and the time of :meth:`Checks.judge` by name. ``until_s``: deadline
-    on the monotonic clock, when the process is killed. InputError without a verdict.
+    ``question``: artefact and car (texts), settings (JSON), the recent samples (bytes of each of
+    their arrays), the files and the time of :meth:`Checks.judge` by name. ``until_s``: deadline on
+    the monotonic clock, when the process is killed. InputError without a verdict.
     """
     line = [*RUN_MODULE, __name__, str(os.getpid())]
     asked, left_s = msgpack.packb(question), max(until_s - time.monotonic(), 0.0)
@@ -314,8 +328,9 @@ def main() -> int:
     question = msgpack.unpackb(sys.stdin.buffer.read())
     settings = GateSettings.model_validate_json(question.pop("settings"))
     car, artefact = described_car(question.pop("car")), Path(question.pop("artefact"))
-    features, residuals = (np.frombuffer(question.pop(name)) for name in Samples._fields)
-    recent = Samples(features.reshape(-1, len(FEATURES)), residuals.reshape(-1, len(OUTPUTS)))
+    features, *others = (np.frombuffer(question.pop(name)) for name in Samples._fields)
+    by_output = (one.reshape(-1, len(OUTPUTS)) for one in others)
+    recent = Samples(features.reshape(-1, len(FEATURES)), *by_output)
     verdict = Checks(settings, artefact, car).judge(recent=recent, **question)
     sys.stdout.buffer.write(msgpack.packb(verdict._asdict()))
     return 0

@@ -15,7 +15,7 @@ from typing import Any, Final
 
 from bayesrace.controller.settings import GateSettings
 from bayesrace.controller.weights.adoption import Adoption, Ruling, Task, WeightsPort
-from bayesrace.controller.weights.checks import judged
+from bayesrace.controller.weights.checks import Samples, judged
 from bayesrace.controller.weights.store import AcceptedWeights, digest_of
 from bayesrace.errors import InputError
 from bayesrace.messages import ROLLBACK, WEIGHTS, Scalar
@@ -170,12 +170,12 @@ class WeightUpdateManager:
 
     def _judge(self, data: bytes, reverted: int, due_s: float) -> Any:
         """The verdict of another process, by what is in use now."""
-        recent, in_use = self._ask(self._port.step.samples, reverted)[1], self._history.in_use
-        features, residuals = recent
+        recent = Samples(*self._ask(self._port.step.samples, reverted)[1])
+        in_use = self._history.in_use
         question = {
             "artefact": str(self._port.artefact), "car": car_text(self._port.car),
             "settings": self._settings.model_dump_json(), "data": data,
-            "features": features.tobytes(), "residuals": residuals.tobytes(),
+            **{name: array.tobytes() for name, array in recent._asdict().items()},
             "in_use": in_use.data, "reference": self._history.reference.data,
             "accepted_utc_ns": in_use.accepted_utc_ns,
         }  # fmt: skip

@@ -33,7 +33,8 @@ from tests.takeover.spoilt_weights import SPOILT, spoilt
 def drive(car: CarParameters) -> Samples:
     """600 samples of a drive that nothing here was learned from."""
     found = fit_weights(car, KINDS, count=600, seed=7)
-    return Samples(found.sample_features, found.sample_residuals)
+    features, residuals = found.sample_features, found.sample_residuals
+    return Samples(features, residuals, np.zeros_like(residuals))
 
 
 @pytest.fixture(scope="module")
@@ -131,7 +132,7 @@ def test_good_weights_count_beside_those_in_use_that_may_be_bad(
 def test_with_few_samples_weights_are_accepted_on_probation(
     checks: Checks, honest: GpWeights, drive: Samples, count: int
 ) -> None:
-    few = Samples(drive.features[:count], drive.residuals[:count])
+    few = Samples(*(one[:count] for one in drive))
     verdict = judged(checks, spoilt(honest, "flip vy"), None, few)
     assert verdict.packed
     assert (verdict.data["samples"], verdict.data["probation"]) == (count, True)

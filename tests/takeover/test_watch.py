@@ -23,6 +23,7 @@ from tests.takeover.rig import KINDS
 from tests.takeover.spoilt_weights import SPOILT, spoilt
 
 STEP_S = 0.02
+RESOLUTION = np.array([0.002, 0.004, 0.04])
 LIMIT_SAMPLES = 40
 """Within which the watch has to roll spoilt weights back; the car starts at 1.5 m/s."""
 
@@ -56,11 +57,13 @@ def adopt(step: NativeStep, new: GpWeights) -> None:
     step.adopt_weights()
 
 
-def show(step: NativeStep, drive: Drive, first: int = 0, last: int = 600) -> Iterator[int]:
-    """The drive to the controller, sample by sample."""
+def show(
+    step: NativeStep, drive: Drive, first: int = 0, last: int = 600, noise: Floats | None = None
+) -> Iterator[int]:
+    """The drive to the controller, sample by sample; ``noise`` (n, 2, 7): of each."""
     x, u = drive
     for k in range(first, last):
-        step.observe(x[k], u[k], STEP_S, x[k + 1])
+        step.observe(x[k], u[k], STEP_S, x[k + 1], None if noise is None else noise[k])
         step.prepare()
         yield k
 
@@ -78,7 +81,7 @@ def watched(
     found: list[tuple[int, Ruling]] = []
     for k in show(step, drive, first=before):
         watch.observe(float(drive[0][k, 3]), False)
-        if (ruling := watch.look(step.watch())) is not None:
+        if (ruling := watch.look(step.watch(watch.resolution))) is not None:
             found.append((k + 1 - before, ruling))
             if ruling.action != "slow":
                 break
@@ -93,10 +96,11 @@ def test_the_errors_are_those_of_the_weights(
     step.set_weights(again)
     adopt(step, honest)
     list(show(step, drive, last=90))
-    features, residuals = step.samples()
+    features, residuals, noise = step.samples()
+    assert not noise.any()
     np.testing.assert_allclose(features, reference.sample_features[:90], rtol=0, atol=1e-12)
     np.testing.assert_allclose(residuals, reference.sample_residuals[:90], rtol=0, atol=1e-9)
-    found = step.watch()
+    found = step.watch(RESOLUTION)
     assert (found.samples, found.fresh) == (90, 90)
     rms = np.sqrt((residuals**2).mean(axis=0))
     assert list(found.nominal) == pytest.approx(rms.tolist(), rel=1e-9)
@@ -104,17 +108,60 @@ def test_the_errors_are_those_of_the_weights(
         assert all(0 < one < 0.5 * all_of for one, all_of in zip(errors, rms, strict=True))
 
 
+def test_what_noise_explains_is_no_error(
+    step: NativeStep, drive: Drive, honest: GpWeights, again: GpWeights, car: CarParameters
+) -> None:
+    """Against the formula: each square less the noise, by 1 / (1 + noise / resolution^2)."""
+    noise = np.random.default_rng(2).uniform(0, 4e-5, (90, 2, 7))
+    step.set_weights(again)
+    adopt(step, honest)
+    list(show(step, drive, last=90, noise=noise))
+    _, residuals, stated = step.samples()
+    np.testing.assert_allclose(stated, noise[:, 1, 3:6], rtol=1e-9)
+    found = step.watch(RESOLUTION)
+    weight = 1 / (1 + stated / RESOLUTION**2)
+    beyond = (weight * (residuals**2 - stated)).sum(axis=0) / weight.sum(axis=0)
+    assert list(found.nominal) == pytest.approx(np.sqrt(beyond).tolist(), rel=1e-9)
+    noise[:, 1] = 1.0  # more than all errors
+    list(show(step, drive, 90, 90 + WATCHED, np.tile(noise, (3, 1, 1))))
+    found = step.watch(RESOLUTION)
+    assert [*found.in_use, *found.proven, *found.nominal] == [0.0] * 9
+
+
+def test_states_are_estimated_by_the_proven_weights_while_others_are_watched(
+    step: NativeStep, drive: Drive, honest: GpWeights, again: GpWeights
+) -> None:
+    v = np.concatenate([drive[0][100], drive[1][100]])
+
+    def believed() -> bytes:
+        after, _, _ = step.propagate(v[:7], v[7:], STEP_S, np.zeros(3))
+        return after.tobytes() + step.variance(v).tobytes()
+
+    found = []
+    for weights in (honest, again):
+        step.set_weights(weights)
+        found.append(believed())
+    step.set_weights(honest)
+    adopt(step, again)
+    assert believed() == found[0] != found[1]
+    step.prove_weights()
+    assert believed() == found[1]
+    step.set_weights(zero_weights(honest.car, honest.discretisation))
+    adopt(step, again)  # nothing is proven
+    assert believed() == found[1]
+
+
 def test_the_newest_samples_are_kept(step: NativeStep, drive: Drive, honest: GpWeights) -> None:
     list(show(step, drive))
-    features, _ = step.samples()
+    features, _, _ = step.samples()
     assert len(features) == SAMPLES
     np.testing.assert_array_equal(features[:, :4], drive[0][600 - SAMPLES : 600, 3:])
     adopt(step, honest)
-    found = step.watch()
+    found = step.watch(RESOLUTION)
     assert (found.samples, found.fresh) == (0, 0)
     for _ in range(WATCHED):
         step.prepare()
-    assert step.watch().samples == WATCHED
+    assert step.watch(RESOLUTION).samples == WATCHED
 
 
 def test_the_watch_keeps_honest_weights(
@@ -159,7 +206,7 @@ def test_the_watch_rolls_back_what_leaves_no_solution(
         watch, found = Watch(GateSettings(), car, STEP_S), 0
         for fallen_back in falls:
             watch.observe(0.0, fallen_back)
-            found += watch.look(step.watch()) is not None
+            found += watch.look(step.watch(watch.resolution)) is not None
         assert found == actions
 
 

@@ -15,6 +15,7 @@ from bayesrace.gp.weights import GpWeights, encode_weights, pack_weights, zero_w
 from bayesrace.messages import State
 from bayesrace.operation.closed_loop import ClosedLoop
 from bayesrace.raceline import racing_line
+from bayesrace.sensors import EXACT, Sensors
 from bayesrace.tracks import load_track
 from bayesrace.vehicles import CarParameters
 
@@ -27,30 +28,36 @@ class WatchedLoop(ClosedLoop):
     adoption: Adoption
 
     def _limits(self, state: State) -> Environment | None:
-        self.adoption.observe(state.x[3], self._cycle.driver.fallen_back)
+        driver = self._cycle.driver
+        self.adoption.observe(driver.vx_mps, driver.fallen_back)
         self.adoption.between_cycles(len(self._states))
-        return self.adoption.limits(state.x[3])
+        return self.adoption.limits(driver.vx_mps)
 
 
 class Course:
     """A car on a track, and the checks of its controller."""
 
-    def __init__(self, car: CarParameters, track: str, seconds: float) -> None:
-        self._car, self._seconds = car, seconds
+    def __init__(
+        self, car: CarParameters, track: str, seconds: float, sensors: Sensors = EXACT
+    ) -> None:
+        self._car, self._seconds, self._sensors = car, seconds, sensors
         self._track = load_track(track, car.width_m)
         self._line = racing_line(self._track, car)
         self._artefact = build(BuildSettings(car=car))[0]
         self._checks = Checks(GateSettings(), self._artefact, car)
 
-    def drive(self, weights: GpWeights, proven: GpWeights | None) -> tuple[str, float]:
+    def drive(
+        self, weights: GpWeights, proven: GpWeights | None, seed: int = 0
+    ) -> tuple[str, float]:
         """What became of the weights, and the largest excess over the edge [m]."""
         if not self._checks.judge(encode_weights(weights)).packed:
             return "refused as absurd", -math.inf
         before = proven or zero_weights(weights.car, weights.discretisation)
         controller = self._controller(before)
         controller.native.stage_weights(pack_weights(weights))
-        controller.native.adopt_weights()
-        loop = WatchedLoop(self._car, self._track, self._line, controller)
+        controller.native.adopt_weights(weights.version)
+        seen: dict[str, Any] = {"sensors": self._sensors, "seed": seed}
+        loop = WatchedLoop(self._car, self._track, self._line, controller, **seen)
         history = SimpleNamespace(in_use=SimpleNamespace(proven=False))
         port: Any = SimpleNamespace(step=controller.native, car=self._car, history=history)
         loop.adoption = Adoption(port, GateSettings())
