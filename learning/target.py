@@ -10,6 +10,9 @@ With error = truth - mean, over n samples
     R^2                      1 - sum(error^2) / sum((truth - mean(truth))^2)
     coverage                 share of |error| <= 1.96 sigma, the 95 % interval
     log predictive density   mean of log N(error; 0, sigma^2)
+
+Where the truth is estimated its variance ("noise") is no error: it is taken off each square in RMSE
+and R^2, and is in sigma^2.
 """
 
 import math
@@ -36,15 +39,24 @@ _TESTS: Final = 2000
 
 @dataclass(frozen=True, eq=False)
 class PredictionErrors:
-    """Errors and predictive standard deviations of one output, each (n,), in the same unit."""
+    """Errors and predictive standard deviations of one output, each (n,), in the same unit.
+
+    ``noise`` (n,): variances of the truth that is compared with; they are in those of sigma.
+    """
 
     error: Floats
     sigma: Floats
+    noise: Floats | float = 0.0
 
     @property
     def rmse(self) -> float:
-        """Root mean square error."""
-        return float(np.sqrt(np.mean(self.error**2)))
+        """Root mean square error, beyond the noise."""
+        return self._beyond(self.error)
+
+    def _beyond(self, values: Floats, scale: float = 1.0) -> float:
+        """Root mean square of values in units of which ``scale`` make one of the errors."""
+        noise = float(np.mean(self.noise)) * scale**2
+        return math.sqrt(max(float(np.mean(values**2)) - noise, 0.0))
 
     @property
     def log_density(self) -> float:
@@ -81,11 +93,13 @@ class PredictionErrors:
         ``truth`` (n,), errors and sigmas may be in scaled units: ``offset + scale * truth`` is the
         measured quantity, and the scores are in its unit. R^2 is 0 where ``truth`` is constant.
         """
-        spread = float(np.sum((truth - truth.mean()) ** 2))
+        noise = np.broadcast_to(self.noise, truth.shape)
+        spread = float(np.sum((truth - truth.mean()) ** 2 - noise))
+        left = max(float(np.sum(self.error**2 - noise)), 0.0)
         return {
             "rmse": self.rmse * scale,
-            "uncorrected_rmse": float(np.sqrt(np.mean((offset + scale * truth) ** 2))),
-            "r2": 1.0 - float(np.sum(self.error**2)) / spread if spread > 0 else 0.0,
+            "uncorrected_rmse": self._beyond(offset + scale * truth, scale),
+            "r2": 1.0 - left / spread if spread > 0 else 0.0,
             "coverage": float(np.mean(np.abs(self.error) <= NORMAL_95 * self.sigma)),
             "log_density": self.log_density - math.log(scale),
         }
@@ -165,7 +179,7 @@ class Target:
         mean, sigma = posterior.predict_without(self.folds[rows], self.z[tests], own)
         if (known := self.known[tests]).any():
             sigma = np.sqrt(sigma**2 + known)
-        return PredictionErrors(self.y[tests] - mean, sigma)
+        return PredictionErrors(self.y[tests] - mean, sigma, known)
 
     @property
     def unknown(self) -> float:

@@ -112,8 +112,9 @@ def recalled(weights: GpWeights, car: CarParameters) -> Dataset:
 class Validation:
     """Residual of the nominal model, predicted mean and standard deviation, each (n, 3), SI units.
 
-    ``sigma`` includes the learned noise. ``metrics``: per output ``rmse`` and ``uncorrected_rmse``
-    (with and without the GP), ``r2``, ``coverage`` of the 95 % interval, ``log_density``.
+    ``sigma`` includes the learned noise, and what is not known of estimated states, which is no
+    error. ``metrics``: per output ``rmse`` and ``uncorrected_rmse`` (with and without the GP),
+    ``r2``, ``coverage`` of the 95 % interval, ``log_density``.
     """
 
     residual: Floats
@@ -167,10 +168,13 @@ def validate(weights: GpWeights, dataset: Dataset, discretisation: Discretisatio
     # On a busy machine the threads of BLAS wait for each other longer than they work.
     with threadpool_limits(1):
         mean, sigma = evaluate_mean(weights, z), predictive_sigma(weights, z)
+    if (noise := dataset.deviation[:, :3] ** 2).any():
+        sigma = np.sqrt(sigma**2 + noise)
+    columns = zip(OUTPUTS, truth.T, mean.T, sigma.T, noise.T, strict=True)
     with np.errstate(all="ignore"):
         metrics = {
-            output: PredictionErrors(truth[:, i] - mean[:, i], sigma[:, i]).metrics(truth[:, i])
-            for i, output in enumerate(OUTPUTS)
+            output: PredictionErrors(true - found, spread, known).metrics(true)
+            for output, true, found, spread, known in columns
         }
     if not all(math.isfinite(value) for one in metrics.values() for value in one.values()):
         raise InputError(

@@ -11,6 +11,7 @@ from bayesrace.gp.expression import evaluate_mean
 from bayesrace.gp.weights import FEATURES, KERNELS, OUTPUTS, zero_weights
 from bayesrace.integrators import PREDICTION, Discretisation
 from bayesrace.learning.dataset import ROUNDING, Dataset, concatenate, filter_dataset
+from bayesrace.learning.drives import Estimates
 from bayesrace.learning.gaussian_process import (
     Covariance,
     PairDistances,
@@ -283,6 +284,29 @@ def test_update_with_new_driving_improves(driven: Dataset) -> None:
     assert all(new[name]["rmse"] < old[name]["rmse"] for name in OUTPUTS)
     assert after.kernels == before.kernels
     assert after.version != before.version
+
+
+def test_what_is_not_known_of_a_state_is_no_error_of_the_weights(driven: Dataset) -> None:
+    """The same samples exactly, and with noise of known deviations that are not alike."""
+    weights = train(driven, PREDICTION, QUICK)
+    exact = drive(dynamic(CAR), 2000, seed=2)
+    true = validate(weights, exact, PREDICTION).metrics
+    random = np.random.default_rng(3)
+    deviation = np.zeros((len(exact), 4))
+    for i, name in enumerate(OUTPUTS):
+        deviation[:, i] = true[name]["rmse"] * random.uniform(0.2, 3, len(exact))
+    x_next = exact.x_next.copy()
+    x_next[:, 3:6] += random.normal(size=(len(exact), 3)) * deviation[:, :3]
+    estimates = Estimates.settled(deviation)
+    noisy = Dataset(CAR, STEP_S, exact.x, exact.u, x_next, estimates=estimates)
+    blind = Dataset(CAR, STEP_S, exact.x, exact.u, x_next)
+    found, taken = (validate(weights, one, PREDICTION).metrics for one in (noisy, blind))
+    for name in OUTPUTS:
+        for score in ("rmse", "uncorrected_rmse"):
+            assert found[name][score] == pytest.approx(true[name][score], rel=0.12)
+        assert taken[name]["rmse"] > 1.5 * true[name]["rmse"]
+        assert found[name]["r2"] == pytest.approx(true[name]["r2"], abs=0.01)
+        assert found[name]["coverage"] > max(taken[name]["coverage"], 0.9)
 
 
 def test_zero_weights_validate_as_uncorrected(driven: Dataset) -> None:

@@ -356,9 +356,11 @@ def test_scores_do_not_depend_on_the_unit() -> None:
     """Scaled targets give the scores of the residual that they are made from."""
     random = np.random.default_rng(2)
     truth, error, sigma = random.normal(size=(3, 50))
-    scaled = PredictionErrors(error, np.abs(sigma)).metrics(truth, offset=0.3, scale=4.0)
-    plain = PredictionErrors(4 * error, 4 * np.abs(sigma)).metrics(0.3 + 4 * truth)
-    assert scaled == pytest.approx(plain)
+    for noise in (0.0, 0.1 * error**2):
+        one = PredictionErrors(error, np.abs(sigma), noise)
+        four = PredictionErrors(4 * error, 4 * np.abs(sigma), 16 * noise)
+        scaled, plain = one.metrics(truth, offset=0.3, scale=4.0), four.metrics(0.3 + 4 * truth)
+        assert scaled == pytest.approx(plain)
 
 
 # What is reported ------------------------------------------------------------------------------
