@@ -134,7 +134,7 @@ def test_states_are_estimated_by_the_proven_weights_while_others_are_watched(
     v = np.concatenate([drive[0][100], drive[1][100]])
 
     def believed() -> bytes:
-        after, _, _ = step.propagate(v[:7], v[7:], STEP_S, np.zeros(3))
+        after, *_ = step.propagate(v[:7], v[7:], STEP_S, np.zeros(3))
         return after.tobytes() + step.variance(v).tobytes()
 
     found = []
