@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from bayesrace.arrays import Floats
+from bayesrace.controller.assembly import compiled_controller
 from bayesrace.controller.settings import GateSettings
 from bayesrace.controller.weights.checks import Checks, Samples
 from bayesrace.gp.weights import GpWeights, encode_weights, read_weights
@@ -45,8 +46,10 @@ def updated() -> GpWeights:
 class Sampled(ClosedLoop):
     """Keeps the samples that its compiled controller makes of estimates, and the true residuals."""
 
-    def __init__(self, race: Racing, sensors: Sensors, seed: int) -> None:
-        self.controller = race.controller()
+    def __init__(self, race: Racing, sensors: Sensors, seed: int, *, learned: bool = True) -> None:
+        weights = race.weights if learned else None
+        driven_by = race.artefact, race.car, race.track, race.line, weights
+        self.controller = compiled_controller(*driven_by)
         super().__init__(
             race.car, race.track, race.line, self.controller, sensors=sensors, seed=seed
         )
@@ -69,15 +72,14 @@ class Sampled(ClosedLoop):
 
 
 @NOISES
+@pytest.mark.parametrize("learned", [True, False])
 def test_the_noise_of_a_sample_is_what_its_residual_differs_by_from_the_true_one(
-    noise: tuple[float, float],
+    noise: tuple[float, float], learned: bool
 ) -> None:
     """Its mean square over three seeds, of samples that are known well and of the others: those of
     a gap of poses have most of it."""
-    samples, true = zip(
-        *(Sampled(racing(), motion_capture(*noise), seed).samples() for seed in range(3)),
-        strict=True,
-    )
+    seen = (Sampled(racing(), motion_capture(*noise), k, learned=learned) for k in range(3))
+    samples, true = zip(*(one.samples() for one in seen), strict=True)
     stated = np.concatenate([one.noise for one in samples])
     off = np.concatenate([one.residuals for one in samples]) - np.concatenate(true)
     assert (stated > 0).all()
