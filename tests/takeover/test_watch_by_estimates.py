@@ -23,10 +23,10 @@ from bayesrace.operation.closed_loop import ClosedLoop
 from bayesrace.operation.preparation import updated_weights
 from bayesrace.operation.settings import PreparationSettings
 from bayesrace.sensors import Sensors
+from tests.instruments import mocap
 from tests.racing import Racing, prepared, racing
 from tests.takeover.spoilt_weights import SPOILT, spoilt
 from tests.takeover.watched import Course
-from tests.test_estimator import motion_capture
 
 TS = 0.02
 LIMIT_CYCLES = 40
@@ -78,7 +78,7 @@ def test_the_noise_of_a_sample_is_what_its_residual_differs_by_from_the_true_one
 ) -> None:
     """Its mean square over three seeds, of samples that are known well and of the others: those of
     a gap of poses have most of it."""
-    seen = (Sampled(racing(), motion_capture(*noise), k, learned=learned) for k in range(3))
+    seen = (Sampled(racing(), mocap(noise), k, learned=learned) for k in range(3))
     samples, true = zip(*(one.samples() for one in seen), strict=True)
     stated = np.concatenate([one.noise for one in samples])
     off = np.concatenate([one.residuals for one in samples]) - np.concatenate(true)
@@ -92,7 +92,7 @@ def test_the_noise_of_a_sample_is_what_its_residual_differs_by_from_the_true_one
 @NOISES
 @pytest.mark.parametrize("seed", range(3))
 def test_honest_updates_are_accepted_and_stay(noise: tuple[float, float], seed: int) -> None:
-    race, sensors = racing(), motion_capture(*noise)
+    race, sensors = racing(), mocap(noise)
     checks = Checks(GateSettings(), race.artefact, race.car)
     recent, _ = Sampled(race, sensors, seed).samples()
     first, new = encode_weights(race.weights), encode_weights(updated())
@@ -107,7 +107,7 @@ def test_honest_updates_are_accepted_and_stay(noise: tuple[float, float], seed: 
 def test_spoilt_weights_are_refused(noise: tuple[float, float]) -> None:
     race = racing()
     checks = Checks(GateSettings(), race.artefact, race.car)
-    recent, _ = Sampled(race, motion_capture(*noise), 0).samples()
+    recent, _ = Sampled(race, mocap(noise), 0).samples()
     first = encode_weights(race.weights)
     for what in SPOILT:
         bad = encode_weights(spoilt(updated(), what))
@@ -120,7 +120,7 @@ def test_spoilt_weights_are_rolled_back_while_the_state_is_known(
     noise: tuple[float, float], what: str
 ) -> None:
     race = racing()
-    course = Course(race.car, "harbour", 4.0, motion_capture(*noise))
+    course = Course(race.car, "harbour", 4.0, mocap(noise))
     became, off_m = course.drive(spoilt(updated(), what), race.weights)
     if became != "refused as absurd":
         assert became.startswith("back at "), became
