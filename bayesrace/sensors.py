@@ -6,7 +6,7 @@ it says of its errors is their standard deviation; offset, outliers and steps it
 """
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Final, Self
 
@@ -213,10 +213,10 @@ SensorsSetting = Annotated[
 """Field of settings that accepts a name or a file and holds all instruments."""
 
 
-def sensor_lines(sensors: Sensors) -> Iterator[str]:
-    """The sections of a TOML file, from what is not by default."""
+def sensor_lines(sensors: Sensors, remarks: Mapping[str, Sequence[str]]) -> Iterator[str]:
+    """The sections of a TOML file, from what is not by default, each after its remarks."""
     for name, instrument in sensors.root.items():
-        yield from ("", f"[sensors.{name}]")
+        yield from ("", *(f"# {one}" for one in remarks.get(name, ())), f"[sensors.{name}]")
         for field, value in instrument.model_dump(exclude_defaults=True).items():
             about = Instrument.model_fields[field].description
             yield f"{field} = {_value(value)}  # {about}"
@@ -230,4 +230,4 @@ def _value(value: Any) -> str:
 
 def write_sensors(path: Path, sensors: Sensors) -> None:
     """Writes what :func:`get_sensors` reads; not for none."""
-    write_whole(path, "\n".join(sensor_lines(sensors)).lstrip() + "\n")
+    write_whole(path, "\n".join(sensor_lines(sensors, {})).lstrip() + "\n")

@@ -15,6 +15,7 @@ import json
 from collections.abc import Collection, Mapping, Sequence
 from functools import cache
 from pathlib import Path
+from types import MappingProxyType
 from typing import Annotated, Any, Final
 
 from pydantic import (
@@ -379,8 +380,16 @@ def _check_model(section: str, models: Collection[str], given: Any) -> None:
         )
 
 
-def write_car(path: Path | str, car: CarParameters, remarks: Sequence[str] = ()) -> None:
-    """Writes remarks, and the car with all its values and their meaning, for :func:`read_car`."""
+def write_car(
+    path: Path | str,
+    car: CarParameters,
+    remarks: Sequence[str] = (),
+    sensor_remarks: Mapping[str, Sequence[str]] = MappingProxyType({}),
+) -> None:
+    """Writes remarks, and the car with all its values and their meaning, for :func:`read_car`.
+
+    ``sensor_remarks``: what is said of each instrument, by its name.
+    """
     parts = [(section, getattr(car, section, car)) for section in _ORDER]
     parts += [(f"tuning.{name}", part) for name, part in car.tuning]
     lines = [*(f"# {one}" for one in remarks), f'name = "{car.name}"']
@@ -390,7 +399,7 @@ def write_car(path: Path | str, car: CarParameters, remarks: Sequence[str] = ())
         names = SECTIONS.get(section) or type(part).model_fields
         given = [name for name in names if getattr(part, name) is not None]
         lines += ["", f"[{section}]", *(_line(part, name) for name in given)]
-    lines += sensor_lines(car.sensors)
+    lines += sensor_lines(car.sensors, sensor_remarks)
     write_whole(Path(path), "\n".join(lines) + "\n")
 
 
