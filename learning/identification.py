@@ -11,31 +11,36 @@ count as right; those of others are compared with it.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from bayesrace.arrays import AnyArray, Floats
-from bayesrace.learning.instruments import Recorded, cut
+from bayesrace.arrays import Floats
+from bayesrace.learning.instruments import WHOLE, Drives
 from bayesrace.learning.settings import Progress
-from bayesrace.learning.single_track import Numbers, rates
-from bayesrace.learning.window_fit import MOST_SLIP_RAD, Fit, polynomials, states_of
+from bayesrace.learning.single_track import TYRES, Cars
+from bayesrace.learning.window_fit import Fit, polynomials, states_of
 from bayesrace.messages import QUANTITIES
+from bayesrace.sensors import FIELDS, Sensors
 from bayesrace.vehicles import CarParameters
 from bayesrace.vehicles.parts import GRAVITY_MPS2, DcMotor
 
 __all__ = ["Comparison", "Identified", "Value", "identify"]
 
-_ROUNDS: Final = ((0.2, 1e-3), (0.5, 1e-4), (0.5, 1e-5))
+_ROUNDS: Final = ((0.2, 1e-2), (0.5, 1e-3), (0.5, 1e-5))
 """Of the fit: length of the windows [s], as what is far from the truth goes far astray in long
 ones, and change of the sum of squares, over it, at which it ends."""
-_SHORT_S: Final = 0.16
-"""Of windows in which a parabola follows the car, to compare with."""
+_CHOICE: Final = 1
+"""Round before which one model of tyres is left: that with the smaller misfit."""
 _QUANTILE: Final = 0.98
 """Of the accelerations: the largest that the drive held."""
 _HELD: Final = 0.7
 """Share of the steering range on the skid pad whose acceleration is the friction."""
 _DRAWS: Final = 60
+_UNSURE: Final = 0.1
+"""Standard error over the value: a number that the drive does not show."""
+_UNITS: Final = dict(zip(QUANTITIES, ("m", "m", "rad", "m/s", "m/s", "rad/s", "rad"), strict=True))
+_OFFSETS: Final = {"omega": "gyro_radps", "delta": "angle_rad"}
 
 
 class Value(NamedTuple):
@@ -47,11 +52,17 @@ class Value(NamedTuple):
     """Standard error."""
     unit: str
     meaning: str
+    instrument: str = ""
+    """Whose number it is; empty: the car's."""
+
+    def __str__(self) -> str:
+        number = f"{self.value:.5g} ± {self.error:.2g} {self.unit}"
+        return f"{self.name} = {number}: {self.meaning}"
 
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Accelerations as parabolas through the poses of short windows have them, and as modelled."""
+    """Mean accelerations in windows: of parabolas through their poses, and as modelled."""
 
     speed_mps: Floats
     command: Floats
@@ -66,31 +77,36 @@ class Identified:
 
     car: CarParameters
     values: tuple[Value, ...]
+    unknown: tuple[str, ...]
+    """What the drive does not show, each with the remedy."""
     used_s: float
     """Driving that was used, and that there was."""
     driven_s: float
     refused: int
     """Readings far from all others."""
-    limit: bool
-    """Whether the drive has reached the limit of the tyres, which friction is then of."""
     comparison: Comparison
 
     def remarks(self, logs: Sequence[str]) -> list[str]:
-        """Lines that say where the numbers are from."""
-        found = [
-            f"{v.name} = {v.value:.5g} ± {v.error:.2g} {v.unit}: {v.meaning}" for v in self.values
-        ]
+        """Lines that say where the car's numbers are from."""
         return [
             f"Identified by 'bayesrace identify' from {self.used_s:.0f} s of {', '.join(logs)};",
             "each number with its standard error:",
-            *(f"    {one}" for one in found),
+            *(f"    {one}" for one in self.values if not one.instrument),
+            *self.unknown,
         ]
+
+    def sensor_remarks(self) -> dict[str, list[str]]:
+        """The same of each instrument."""
+        found: dict[str, list[str]] = {}
+        for one in self.values:
+            if one.instrument:
+                found.setdefault(one.instrument, []).append(str(one))
+        return found
 
 
 def identify(
     car: CarParameters,
-    runs: Sequence[Recorded],
-    instruments: Sequence[str],
+    drives: Drives,
     *,
     wheelbase: bool = False,
     progress: Progress | None = None,
@@ -100,46 +116,54 @@ def identify(
     ``wheelbase``: it is not known, either; then the steering's gain is 1. InputError if there is
     too little driving, if the commands hardly change, or if no such car drove.
     """
-    fit = Fit(car, list(runs), len(instruments), wheelbase)
+    fits = [
+        Fit(car.model_copy(update={"tyres": tyres}), drives, wheelbase=wheelbase) for tyres in TYRES
+    ]
     for number, (window_s, close) in enumerate(_ROUNDS):
+        if number == _CHOICE:
+            fits = [min(fits, key=lambda fit: fit.misfit)]
+        for fit in fits:
+            fit.improve(window_s, close)
         if progress is not None:
-            progress(number / len(_ROUNDS), "")
-        fit.improve(window_s, close)
-    return _Report(fit, instruments).identified()
+            progress((number + 1) / len(_ROUNDS), "")
+    fits[0].check()
+    return _Report(car, fits[0]).identified()
 
 
 class _Report:
     """From the fit to the numbers of a car's file."""
 
-    def __init__(self, fit: Fit, instruments: Sequence[str]) -> None:
-        self._fit, self._instruments = fit, instruments
+    def __init__(self, car: CarParameters, fit: Fit) -> None:
+        self._car, self._fit, self._instruments = car, fit, fit.drives.instruments
         self._covariance = fit.covariance()
-        self._names = [*Numbers._fields, *(f"late {one}" for one in instruments[1:])]
-        errors = np.sqrt(np.diag(self._covariance))
-        free = [self._names[i] for i in fit.free]
-        self._found = dict(zip(free, zip(fit.theta, errors, strict=True), strict=True))
+        pairs = zip(fit.theta, np.sqrt(np.diag(self._covariance)), strict=True)
+        self._found = dict(zip(fit.names, pairs, strict=True))
+        numbers, _ = fit.numbers(fit.theta[None])
+        self._motion = fit.track.drive(numbers, fit.windows, fit.states[None])
 
     def identified(self) -> Identified:
         """All of it."""
-        fit, car = self._fit, self._fit.car
-        friction, limit = self._friction()
-        values = [*self._drive(), *self._actuators(), friction, *self._sensors()]
-        known = {one.name: one.value for one in values}
-        changes: dict[str, object] = {"friction": round(friction.value, 4)}
+        fit, car = self._fit, self._car
+        friction, unknown = self._friction()
+        values = [*self._values(), friction]
+        known = {one.name: one for one in values}
+        if "cr2" in known and known["cr2"].error > _UNSURE * known["cr2"].value:
+            unknown.append(_unsure(known["cr2"]))
+        sensors, measured = self._sensors()
+        changes: dict[str, object] = {"friction": round(friction.value, 4), "sensors": sensors}
         if isinstance(car.drive, DcMotor):
-            numbers = {name: float(f"{known[name]:.5g}") for name in ("cm1", "cm2", "cr0", "cr2")}
+            numbers = {name: float(f"{known[name].value:.5g}") for name in car.drive.numbers()}
             changes["drive"] = car.drive.model_dump() | numbers
         if "wheelbase" in known:
-            share = known["wheelbase"] / car.wheelbase_m
+            share = known["wheelbase"].value / car.wheelbase_m
             changes |= {one: float(f"{share * getattr(car, one):.5g}") for one in ("lf_m", "lr_m")}
-        values_of_file = car.model_dump(exclude_unset=True) | changes
         return Identified(
-            car=CarParameters.model_validate(values_of_file),
-            values=tuple(values),
-            used_s=int(fit.used.sum()) * fit.periods * fit.step_s,
+            car=CarParameters.model_validate(car.model_dump(exclude_unset=True) | changes),
+            values=(*values, *measured),
+            unknown=tuple(unknown),
+            used_s=fit.used_s,
             driven_s=fit.driven_s,
             refused=fit.refused,
-            limit=limit,
             comparison=self._comparison(),
         )
 
@@ -147,129 +171,154 @@ class _Report:
         value, error = self._found[key]
         return Value(name, times * float(value), times * float(error), unit, meaning)
 
-    def _drive(self) -> list[Value]:
-        car, mass = self._fit.car, self._fit.car.mass_kg
-        if isinstance(car.drive, DcMotor):
-            return [
-                self._value("a1", "cm1", "N", "motor force per duty cycle at standstill", mass),
-                self._value("a2", "cm2", "N s/m", "its loss with speed", mass),
-                self._value("a3", "cr0", "N", "rolling resistance", mass),
-                self._value("a4", "cr2", "N s²/m²", "drag", mass),
-            ]
-        return [
-            self._value("a1", "drive gain", "1", "acceleration over that commanded"),
-            self._value("a3", "resistance", "m/s²", "rolling resistance, which the GP learns"),
-            self._value("a4", "drag", "1/m", "drag, which the GP learns"),
-        ]
+    def _values(self) -> list[Value]:
+        """What was found of drive and steering."""
+        mass = self._car.mass_kg
+        drive = {
+            "a1": ("drive gain", "1", "acceleration over that commanded"),
+            "a3": ("resistance", "m/s²", "rolling resistance, which the GP learns"),
+            "a4": ("drag", "1/m", "drag, which the GP learns"),
+        }
+        motor = {
+            "a1": ("cm1", "N", "motor force per duty cycle at standstill", mass),
+            "a2": ("cm2", "N s/m", "its loss with speed", mass),
+            "a3": ("cr0", "N", "rolling resistance", mass),
+            "a4": ("cr2", "N s²/m²", "drag", mass),
+        }
+        about = f"command to car, by the times of {self._instruments[0]}"
+        rows = (motor if isinstance(self._car.drive, DcMotor) else drive) | {
+            "delay_s": ("delay", "ms", about, 1e3),
+            "lag_s": ("steering lag", "ms", "first order, behind the delay", 1e3),
+            "offset_rad": ("steering offset", "rad", "angle at a commanded angle of 0"),
+            "gain": ("steering gain", "1", "angle over that commanded"),
+            "size": ("wheelbase", "m", "lf + lr", self._car.wheelbase_m),
+        }
+        return [self._value(key, *row) for key, row in rows.items() if key in self._found]
 
-    def _actuators(self) -> list[Value]:
-        first = self._instruments[0]
-        values = [
-            self._value("delay_s", "delay", "ms", f"command to car, by the times of {first}", 1e3),
-            self._value("lag_s", "steering lag", "ms", "first order, behind the delay", 1e3),
-            self._value("offset_rad", "steering offset", "rad", "angle at a commanded angle of 0"),
-        ]
-        if "gain" in self._found:
-            values.append(self._value("gain", "steering gain", "1", "angle over that commanded"))
-        if "size" in self._found:
-            length_m = self._fit.car.wheelbase_m
-            values.append(self._value("size", "wheelbase", "m", "lf + lr", length_m))
-        return values
-
-    def _sensors(self) -> list[Value]:
-        fit, values = self._fit, []
+    def _sensors(self) -> tuple[Sensors, list[Value]]:
+        """Those of the file, with what was found of those that were logged."""
+        values: list[Value] = []
+        sensors = self._car.sensors.model_dump()
         for number, name in enumerate(self._instruments):
-            ages = np.concatenate([
-                run.readings.age_s[run.readings.instrument == number] for run in fit.runs
-            ])  # fmt: skip
-            spread = float(ages.std() / np.sqrt(len(ages)))
-            about = f"{name}: measurement to report"
-            values.append(
-                Value(f"{name} reported", 1e3 * float(ages.mean()), 1e3 * spread, "ms", about)
-            )
-            if number:
-                about = f"{name}: its times, against those of {self._instruments[0]}"
-                values.append(self._value(f"late {name}", f"{name} late", "ms", about, 1e3))
-            for of, quantity in enumerate(QUANTITIES):
-                if (count := fit.counted[number, of]) > 0:
-                    noise = float(fit.deviation[number, of])
-                    unit = ["m", "m", "rad", "m/s", "m/s", "rad/s", "rad"][of]
-                    values.append(
-                        Value(f"{name} {quantity}", noise, noise / float(np.sqrt(2 * count)), unit,
-                              f"{name}: standard deviation of the noise")
-                    )  # fmt: skip
-        for key, name, unit in (
-            ("gyro_radps", "yaw rate offset", "rad/s"), ("angle_rad", "angle offset", "rad")
-        ):  # fmt: skip
-            if key in self._found:
-                values.append(self._value(key, name, unit, "of what is measured"))
-        return values
+            found: dict[str, Any] = {}
+            given = sensors.get(name, {})
+            for of in np.flatnonzero(self._fit.counted[number]).tolist():
+                field = FIELDS[QUANTITIES[of]]
+                channel, of_channel = self._channel(number, of)
+                found[field] = (given.get(field) or {}) | channel
+                values += of_channel
+            if name != WHOLE:  # which has no section
+                timing, of_timing = self._timing(number)
+                sensors[name] = given | found | timing
+                values += of_timing
+        return Sensors.model_validate(sensors), values
 
-    def _friction(self) -> tuple[Value, bool]:
+    def _channel(self, number: int, of: int) -> tuple[dict[str, float], list[Value]]:
+        """Noise and offset of one quantity, by the names of a file."""
+        fit, name, quantity = self._fit, self._instruments[number], QUANTITIES[of]
+        times, one = fit.noise[number, of], fit.measured(number, of)
+        value, stated = one["value"], one["deviation"]
+        noise = float(times * np.median(stated))
+        error, about = noise / np.sqrt(2 * fit.counted[number, of]), "deviation of the noise"
+        unit = _UNITS[quantity]
+        values = [Value(f"{name} {quantity}", noise, float(error), unit, about, name)]
+        grown = stated > 1.001 * stated.min()
+        share = np.median(stated[grown] / np.abs(value[grown])) if grown.any() else 0.0
+        found = {"deviation": times * stated.min(), "relative": times * share}
+        if (offset := _OFFSETS.get(quantity, "")) in self._found:
+            constant = self._value(offset, f"{name} {quantity} offset", unit, "constant error")
+            values.append(constant._replace(instrument=name))
+            found["offset"] = constant.value
+        return _rounded(found), values
+
+    def _timing(self, number: int) -> tuple[dict[str, float], list[Value]]:
+        """Rate, delay and jitter of an instrument, by the names of a file.
+
+        A reading waits for the next state, half a period on the average where its moments are
+        anywhere between states. Where they are always the same, the delay is known that much less.
+        """
+        drives = self._fit.drives
+        name, period_s, readings = self._instruments[number], drives.step_s, drives.readings
+        mine = readings[readings["instrument"] == number]
+        between_s, age_s = np.diff(mine["time_s"]), mine["age_s"]
+        rate_hz = 1 / float(np.median(between_s[between_s > 0]))
+        moments = max(1.0, rate_hz * period_s)
+        delay_s, error_s = float(age_s.mean()) - period_s / 2, period_s / np.sqrt(12) / moments
+        values = []
+        if number:
+            about = f"its times, against those of {self._instruments[0]}"
+            late = self._value(f"late {number}", f"{name} late", "ms", about, 1e3)
+            values.append(late._replace(instrument=name))
+            delay_s += late.value / 1e3
+        delay_s = min(max(delay_s, 0.0), 1.0)
+        waiting = period_s**2 / 12 * (1 - 1 / moments**2)
+        jitter_s = min(float(np.sqrt(3 * max(0.0, age_s.var() - waiting))), delay_s)
+        for what, one, about in (
+            ("delay", delay_s, "measurement to report"), ("jitter", jitter_s, "of the delay")
+        ):  # fmt: skip
+            values.append(Value(f"{name} {what}", 1e3 * one, 1e3 * error_s, "ms", about, name))
+        return _rounded({"rate_hz": rate_hz, "delay_s": delay_s, "jitter_s": jitter_s}), values
+
+    def _accelerations(self) -> Floats:
+        """Along the car and to its left in each period of each window, (periods, w, 2)."""
+        x, rate = self._motion.begin[:, 0], self._motion.begin_rate[:, 0]
+        turning = x[..., 5, None] * np.stack([-x[..., 4], x[..., 3]], axis=-1)
+        return np.asarray(rate[..., 3:5] + turning)
+
+    def _friction(self) -> tuple[Value, list[str]]:
         """What a skid pad gives with some steering left, or what the drive has held if that is
-        less; and whether it was the former."""
+        less; and what is then unknown."""
         fit, random = self._fit, np.random.default_rng(0)
-        numbers, _ = fit.numbers(fit.theta[None])
-        path = fit.track.drive(numbers, fit.base, fit.states[:, None])
-        rate, x = (np.moveaxis(one[:, 1, :, 0], 0, -1) for one in (path.begin_rate, path.begin))
-        along, across = rate[3] - x[4] * x[5], rate[4] + x[3] * x[5]
-        way = np.abs(x[3] * across - x[4] * along) / np.hypot(x[3], x[4])
-        total = way[fit.used] / GRAVITY_MPS2
+        total = np.abs(self._accelerations()[:, fit.used, 1]).T / GRAVITY_MPS2
         draws = random.integers(len(total), size=(_DRAWS, len(total)))
         held = float(np.quantile(total, _QUANTILE))
         spread = float(np.std([np.quantile(total[rows], _QUANTILE) for rows in draws]))
         thetas = random.multivariate_normal(fit.theta, self._covariance, _DRAWS)
-        with np.errstate(over="ignore", invalid="ignore"):  # without a limit, it ends nowhere
-            pad = _skid_pad(fit.car, fit.numbers(fit.clipped(np.vstack([fit.theta, thetas])))[0])
+        pad = _skid_pad(fit.car, fit.numbers(fit.clipped(np.vstack([fit.theta, thetas])))[0])
         about = f"acceleration over g on a skid pad at {_HELD:.0%} of the steering"
         if pad[0] <= held:
-            return Value("friction", float(pad[0]), float(np.std(pad[1:])), "1", about), True
+            return Value("friction", float(pad[0]), float(np.std(pad[1:])), "1", about), []
         about = "largest lateral acceleration of the drive over g; there may be more"
-        return Value("friction", held, spread, "1", about), False
+        remedy = "friction: this drive did not reach the limit of the tyres; drive faster for it"
+        return Value("friction", held, spread, "1", about), [remedy]
 
     def _comparison(self) -> Comparison:
-        fit = self._fit
-        periods = max(4, round(_SHORT_S / fit.step_s))
-        length_s = periods * fit.step_s
-        late_s = fit.numbers(fit.theta[None])[1][0]
-        windows = cut(fit.runs, periods, late_s)
-        curves, good = polynomials(windows, 2, length_s, alone=True)
-        x = states_of(curves, 0.5, length_s)
-        numbers, _ = fit.numbers(fit.theta[None])
-        poses = ((windows.weight > 0) & (windows.of == 0)).sum(axis=1)
-        base = fit.track.base(windows)
-        used = (poses > 4) & (x[3] > 0.2) & (np.abs(np.arctan2(x[4], x[3])) < MOST_SLIP_RAD)
-        used &= (good | (windows.weight <= 0)).all(axis=1)
-        index = base[:, None] + np.arange(periods) - round(numbers.delay_s.item() / fit.step_s)
-        d, angle = (one.mean(axis=1) for one in fit.track.commands(np.maximum(index, 0)))
-        delta = numbers.gain * angle + numbers.offset_rad
-        rate = rates(fit.car, numbers, x[:, None], d[None], delta)[:, 0]
-        modelled = np.column_stack([rate[3] - x[4] * x[5], rate[4] + x[3] * x[5]])
-        head, left = np.cos(x[2]), np.sin(x[2])
+        fit, length_s = self._fit, self._fit.periods * self._fit.drives.step_s
+        curves, _ = polynomials(fit.windows, 2, length_s)
+        x, command = states_of(curves, 0.5, length_s), fit.track.commands(fit.windows)[0]
         xx, yy = 2 * curves[:2, :, 2] / length_s**2
-        measured = np.column_stack([xx * head + yy * left, yy * head - xx * left])
-        return Comparison(x[3, used], d[used], measured[used], modelled[used])
+        cos, sin = np.cos(x[:, 2]), np.sin(x[:, 2])
+        measured = np.column_stack([xx * cos + yy * sin, yy * cos - xx * sin])
+        both = measured[fit.used], self._accelerations().mean(axis=0)[fit.used]
+        return Comparison(x[fit.used, 3], command[fit.used].mean(axis=1), *both)
 
 
-def _skid_pad(car: CarParameters, numbers: Numbers) -> Floats:
-    """Largest lateral acceleration over g of cars (p,) on rising throttle, their steering held."""
-    delta = np.full_like(numbers.a1, _HELD * car.delta_max_rad)
-    length_m, unit_s = car.wheelbase_m, np.sqrt(car.wheelbase_m / GRAVITY_MPS2)
-    x = np.zeros((6, len(delta), 1))
-    x[3] = np.sqrt(0.3 * GRAVITY_MPS2 * length_m / delta)
-    x[5] = x[3] * delta / length_m
-    best, going = np.zeros(len(delta)), np.ones(len(delta), bool)
-    steps, h = 1000, 0.1 * unit_s
+def _rounded(found: dict[str, float]) -> dict[str, float]:
+    """To as many digits as a file needs."""
+    return {name: float(f"{one:.4g}") for name, one in found.items()}
+
+
+def _unsure(drag: Value) -> str:
+    return (
+        f"{drag.name}: this drive hardly shows it ({drag.value:.2g} ± {drag.error:.2g} {drag.unit})"
+        ", as cm2 and cr0 make up for it; add the log of half a minute that alternates full "
+        "throttle, up to top speed, and coasting (drive command 0), down to walking pace"
+    )
+
+
+def _skid_pad(car: CarParameters, numbers: Floats) -> Floats:
+    """Largest lateral acceleration over g of cars (p, n) on rising throttle, their steering
+    held."""
+    delta, length_m = _HELD * car.delta_max_rad, car.wheelbase_m
+    x = np.zeros((len(numbers), 1, 6))
+    x[..., 3] = np.sqrt(0.3 * GRAVITY_MPS2 * length_m / delta)
+    x[..., 5] = x[..., 3] * delta / length_m
+    best, going = np.zeros((len(numbers), 1)), np.ones((len(numbers), 1), bool)
+    cars, steps, h = Cars(car, numbers, 1), 1000, 0.1 * np.sqrt(length_m / GRAVITY_MPS2)
     for step in range(steps):
-        d = np.full_like(delta, (0.1 + 0.9 * step / steps) * car.d_max)
-
-        def rate(x: AnyArray, d: AnyArray = d) -> AnyArray:
-            return rates(car, numbers, x, d, delta)
-
-        k1 = rate(x)
-        k2 = rate(x + h / 2 * k1)
-        k3 = rate(x + h / 2 * k2)
-        x = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + rate(x + h * k3))
-        going &= (np.abs(x[4, :, 0]) < 0.7 * np.abs(x[3, :, 0])) & (x[3, :, 0] > 0)
-        best = np.where(going, np.maximum(best, np.hypot(x[3], x[4])[:, 0] * x[5, :, 0]), best)
-    return best / GRAVITY_MPS2
+        d = np.array((0.1 + 0.9 * step / steps) * car.d_max)
+        x = cars.step(x, h, d, np.array([delta] * 3))[1]
+        vx, vy, omega = np.moveaxis(x[..., 3:], -1, 0)
+        going &= (np.abs(vy) < 0.7 * np.abs(vx)) & (vx > 0)  # without a limit, it ends nowhere
+        best = np.where(going, np.maximum(best, np.hypot(vx, vy) * omega), best)
+    return best[:, 0] / GRAVITY_MPS2

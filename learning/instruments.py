@@ -3,56 +3,52 @@
 A log with whole measured states, not estimated ones, has one instrument, ``state``, of all seven.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 
-from bayesrace.arrays import AnyArray, Flags, Floats, Rows
+from bayesrace.arrays import Flags, Floats, Rows
 from bayesrace.columns import Columns, LogColumns
 from bayesrace.errors import InputError
 from bayesrace.learning.dataset import consecutive
-from bayesrace.learning.sources import log_facts
 from bayesrace.messages import QUANTITIES, STATE
-from bayesrace.vehicles import CarParameters, builtin_cars
 
-__all__ = ["Readings", "Recorded", "Windows", "cut", "driven_car", "read_runs"]
+__all__ = ["WHOLE", "Drives", "Windows", "cut", "read_drives"]
 
-_WHOLE: Final = "state"
+WHOLE: Final = "state"
+"""Instrument of whole states."""
 _WHOLE_DEVIATION: Final = 1e-3
 """Of each number of a whole state, to begin with."""
 _COLUMNS: Final = "seq run time_s x u_applied estimated readings"
 
-
-@dataclass(frozen=True, eq=False)
-class Readings:
-    """Single numbers that were measured, (n,) each, in order of time."""
-
-    time_s: Floats
-    """Since the start of the run, as the instrument says."""
-    of: Rows
-    """Index of the quantity in ``QUANTITIES``."""
-    instrument: Rows
-    value: Floats
-    """Headings without jumps."""
-    deviation: Floats
-    age_s: Floats
-    """Time from the measurement to the state that reported it."""
-    reading: Rows
-    """Number of the reading that it came with."""
+_READING: Final = np.dtype([
+    ("run", np.int64),
+    ("time_s", np.float64),  # since the start of the run, as the instrument says
+    ("of", np.int64),  # index of the quantity in QUANTITIES
+    ("instrument", np.int64),
+    ("value", np.float64),  # headings without jumps
+    ("deviation", np.float64),
+    ("age_s", np.float64),  # from the measurement to the state that reported it
+    ("reading", np.int64),  # number of the reading that it came with
+])  # fmt: skip
+"""A single number that was measured."""
 
 
 @dataclass(frozen=True, eq=False)
-class Recorded:
-    """One run without a gap: ``u`` (n, 2) acted in the periods since its start."""
+class Drives:
+    """Runs without a gap, in periods of the same length."""
 
     step_s: float
-    u: Floats
-    readings: Readings
-    angle_rad: float
-    """Steering angle at the start, where it was measured; else 0."""
+    instruments: tuple[str, ...]
+    u: list[Floats]
+    """Inputs (n, 2) that acted in the periods since the start of each run."""
+    angle_rad: list[float]
+    """Steering angle at the start of each, where it was measured; else 0."""
+    readings: Columns
+    """All that was measured, by run and time."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,14 +59,11 @@ class Windows:
     """Number of the run, (w,)."""
     first: Rows
     """Period of the run with which each begins, (w,)."""
+    readings: Columns
     time_s: Floats
-    """Since the beginning of the window."""
-    of: Rows
-    instrument: Rows
-    value: Floats
+    """Since the beginning of the window, less the delays that it was cut with."""
     weight: Floats
     """One over the standard deviation; 0: not to be used."""
-    reading: Rows
 
     def select(self, rows: Flags) -> "Windows":
         """Some of the windows."""
@@ -78,119 +71,93 @@ class Windows:
 
     def without(self, bad: Flags) -> "Windows":
         """Without the readings of which a number is ``bad`` (w, r)."""
-        rows = np.arange(len(bad))[:, None] << 32
-        lost = np.isin(rows + self.reading, (rows + self.reading)[bad & (self.weight > 0)])
-        return Windows(**{**vars(self), "weight": np.where(lost, 0.0, self.weight)})
+        reading = self.readings["reading"]
+        lost = np.isin(reading, reading[bad & (self.weight > 0)])
+        return Windows(**vars(self) | {"weight": np.where(lost, 0.0, self.weight)})
 
 
-def driven_car(
-    paths: Sequence[Path], given: CarParameters | None, name: str
-) -> tuple[CarParameters, str]:
-    """The car to begin with, ``given`` or as the logs name it, and its name in the network.
-
-    InputError if there is none, or if the logs hold another one.
-    """
-    if not paths:
-        raise InputError("no log given; name the log of a drive, as 'bayesrace collect' writes it")
-    facts = [log_facts(path) for path in paths]
-    named = {one for fact in facts for one in fact.names}
-    car = given or next((fact.car for fact in facts if fact.car), None)
-    if car is None and len(named) == 1:
-        car = builtin_cars().get(next(iter(named)))
-    if car is None:
-        raise InputError(f"no log names its car; name the file of {', '.join(named)} with --car")
-    wanted = name or car.name
-    for path, fact in zip(paths, facts, strict=True):
-        if wanted not in fact.names:
-            found = ", ".join(fact.names) or "no car"
-            raise InputError(
-                f"{path} holds states of {found}, not of '{wanted}': give the file of the car that "
-                "drove with --car, or its name in the network with --name"
-            )
-    return car, wanted
-
-
-def read_runs(paths: Sequence[Path], name: str) -> tuple[list[Recorded], tuple[str, ...]]:
-    """The runs of the car of this name in the network, and the names of its instruments.
+def read_drives(drivers: Mapping[Path, str]) -> Drives:
+    """The runs in logs of a car, by its name in the network of each.
 
     What follows a lost state is left out: the steering angle commanded is the sum of all rates.
     InputError if there is no run, or if runs differ in their period.
     """
     instruments: dict[str, int] = {}
-    runs: list[Recorded] = []
-    for path in paths:
+    runs: list[Columns] = []
+    for path, name in drivers.items():
         states = LogColumns(path, {STATE: _COLUMNS}, name).read()[STATE]
-        for run in dict.fromkeys(states["run"].tolist()):
-            runs += _unbroken(states[states["run"] == run], instruments)
+        runs += [_unbroken(states[states["run"] == run]) for run in dict.fromkeys(states["run"])]
+    runs = [run for run in runs if len(run) > 1]
     if not runs:
-        raise InputError(f"{paths[0]}: no two states follow one another; give the log of a drive")
-    if len(steps := sorted({round(run.step_s, 6) for run in runs})) > 1:
+        listed = ", ".join(map(str, drivers))
+        raise InputError(f"{listed}: no two states follow one another; give the log of a drive")
+    if len(steps := sorted({round(_step_s(run), 6) for run in runs})) > 1:
         raise InputError(f"runs with periods of {steps} s cannot be mixed; give logs of one rate")
-    return runs, tuple(instruments)
-
-
-def _unbroken(states: Columns, instruments: dict[str, int]) -> list[Recorded]:
-    """A run up to its first gap, if there is driving in it."""
-    if len(states) < 2:
-        return []
-    step_s = float(np.median(np.diff(states["time_s"])))
-    apart = ~consecutive(states, step_s)
-    last = int(apart.argmax()) if apart.any() else len(apart)
-    if last < 1:
-        return []
-    states = states[: last + 1]
     rows: list[tuple[float, ...]] = []
-    begin_s, count = float(states["time_s"][0]), 0
+    for number, run in enumerate(runs):
+        _read(number, run, instruments, rows)
+    readings = np.array(rows, _READING)
+    return Drives(
+        step_s=_step_s(runs[0]),
+        instruments=tuple(instruments),
+        u=[run["u_applied"][1:] for run in runs],
+        angle_rad=[0.0 if run["estimated"][0] else float(run["x"][0, 6]) for run in runs],
+        readings=_in_order(readings),
+    )
+
+
+def _step_s(states: Columns) -> float:
+    return float(np.median(np.diff(states["time_s"])))
+
+
+def _unbroken(states: Columns) -> Columns:
+    """The states of a run up to its first gap."""
+    if len(states) < 2:
+        return states
+    apart = ~consecutive(states, _step_s(states))
+    return states[: 1 + (int(apart.argmax()) if apart.any() else len(apart))]
+
+
+def _read(
+    run: int, states: Columns, instruments: dict[str, int], rows: list[tuple[float, ...]]
+) -> None:
+    """Appends all numbers that were measured in a run."""
+    begin_s = float(states["time_s"][0])
     columns = (states[name].tolist() for name in ("time_s", "x", "estimated", "readings"))
+    reading = rows[-1][-1] if rows else 0
     for time_s, x, estimated, readings in zip(*columns, strict=True):
         whole = {q: (value, _WHOLE_DEVIATION) for q, value in zip(QUANTITIES, x, strict=True)}
         given = [(one.instrument, one.time_s, one.values) for one in readings]
-        for name, at_s, values in given if estimated else [(_WHOLE, time_s, whole)]:
-            number, count = instruments.setdefault(name, len(instruments)), count + 1
+        for name, at_s, values in given if estimated else [(WHOLE, time_s, whole)]:
+            number, reading = instruments.setdefault(name, len(instruments)), reading + 1
             rows += [
-                (at_s - begin_s, QUANTITIES.index(q), number, *pair, time_s - at_s, count)
+                (run, at_s - begin_s, QUANTITIES.index(q), number, *pair, time_s - at_s, reading)
                 for q, pair in values.items()
             ]
-    readings = _in_order(np.array(rows, dtype=np.float64).reshape(-1, 7))
-    angle_rad = 0.0 if states["estimated"][0] else float(states["x"][0, 6])
-    return [Recorded(step_s, states["u_applied"][1:], readings, angle_rad)]
 
 
-def _in_order(rows: Floats) -> Readings:
-    rows = rows[np.argsort(rows[:, 0], kind="stable")]
-    time_s, of, instrument, value, deviation, age_s, reading = rows.T.copy()
-    heading = of == QUANTITIES.index("psi")
-    value[heading] = np.unwrap(value[heading])
-    of, instrument, reading = (one.astype(np.int64) for one in (of, instrument, reading))
-    return Readings(time_s, of, instrument, value, deviation, age_s, reading)
+def _in_order(readings: Columns) -> Columns:
+    readings = readings[np.lexsort((readings["time_s"], readings["run"]))]
+    heading = readings["of"] == QUANTITIES.index("psi")
+    readings["value"][heading] = np.unwrap(readings["value"][heading])
+    return readings
 
 
-def cut(runs: Sequence[Recorded], periods: int, late_s: Floats) -> Windows:
-    """All readings in windows of so many periods; ``late_s``: by how much the times of each
-    instrument are late."""
-    parts = []
-    for number, run in enumerate(runs):
-        one, length_s = run.readings, periods * run.step_s
-        since_s = one.time_s - late_s[one.instrument]
-        window = np.floor(since_s / length_s).astype(np.int64)
-        for first in range(len(run.u) // periods):
-            rows = np.flatnonzero(window == first)
-            parts.append((number, first * periods, one.time_s[rows] - first * length_s, one, rows))
-    width = max((len(rows) for *_, rows in parts), default=0)
-
-    def padded(kind: type, columns: list[AnyArray]) -> AnyArray:
-        table: AnyArray = np.zeros((len(parts), width), kind)
-        for row, column in zip(table, columns, strict=True):
-            row[: len(column)] = column
-        return table
-
-    return Windows(
-        run=np.array([part[0] for part in parts], np.int64),
-        first=np.array([part[1] for part in parts], np.int64),
-        time_s=padded(float, [part[2] for part in parts]),
-        of=padded(int, [one.of[rows] for *_, one, rows in parts]),
-        instrument=padded(int, [one.instrument[rows] for *_, one, rows in parts]),
-        value=padded(float, [one.value[rows] for *_, one, rows in parts]),
-        weight=padded(float, [1 / one.deviation[rows] for *_, one, rows in parts]),
-        reading=padded(int, [one.reading[rows] for *_, one, rows in parts]),
-    )
+def cut(drives: Drives, periods: int, late_s: Floats) -> Windows:
+    """All readings in windows of so many periods of commands; ``late_s``: from the command to what
+    each instrument says of it."""
+    counts = np.array([len(u) // periods for u in drives.u])
+    run = np.repeat(np.arange(len(counts)), counts)
+    first = periods * (np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts))
+    one, length_s = drives.readings, periods * drives.step_s
+    since_s = one["time_s"] - late_s[one["instrument"]]
+    window = np.floor(since_s / length_s).astype(np.int64)
+    inside = np.flatnonzero((window >= 0) & (window < counts[one["run"]]))
+    window = window[inside] + (np.cumsum(counts) - counts)[one["run"][inside]]
+    inside = inside[order := np.argsort(window, kind="stable")]
+    window = window[order]
+    column = np.arange(len(window)) - np.searchsorted(window, window)
+    rows = np.full((len(run), int(column.max(initial=-1)) + 1), -1)
+    rows[window, column] = inside
+    time_s = since_s[rows] - (first * drives.step_s)[:, None]
+    return Windows(run, first, one[rows], time_s, np.where(rows < 0, 0, 1 / one["deviation"][rows]))

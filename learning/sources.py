@@ -51,7 +51,7 @@ from bayesrace.vehicles import CarParameters, builtin_cars, car_text, described_
 
 __all__ = ["CYCLES", "MAX_BYTES", "STATES", "TRUE_STATES", "LogFacts", "Samples"]
 __all__ += ["dataset_from_columns", "dataset_from_log", "dataset_from_npz", "log_facts"]
-__all__ += ["read_samples", "write_npz"]
+__all__ += ["read_samples", "recorded_car", "write_npz"]
 
 T = TypeVar("T")
 TRUE_STATES: Final = "seq run time_s x u_applied"
@@ -357,11 +357,8 @@ def read_samples(
     logs = {path: log_facts(path) for path in paths if path.suffix.lower() != ".npz"}
     drivers = {path: _driver(path, facts, name) for path, facts in logs.items()}
     files = {path: _read(path) for path in paths if path not in logs}
-    cars = {path: facts.car or builtin_cars().get(drivers[path]) for path, facts in logs.items()}
-    cars |= {path: file.car for path, file in files.items()}
-    driven = _common("cars", cars | {Path("--car"): car}, lambda one: f"'{one.identity}'")
-    if driven is None:
-        raise InputError("no file names its car; name it with --car")
+    cars = _cars(logs, drivers) | {path: file.car for path, file in files.items()}
+    driven = _the_car(cars | {Path("--car"): car})
     named = {path: facts.discretisation for path, facts in logs.items()}
     used = _common("discretisations", named | {Path("as asked for"): discretisation}, _described)
     used = used or PREDICTION
@@ -383,15 +380,49 @@ def read_samples(
     return Samples(concatenate(datasets), used)
 
 
+def recorded_car(
+    paths: Sequence[Path], given: CarParameters | None, name: str
+) -> tuple[CarParameters, dict[Path, str]]:
+    """The car that drove, ``given`` or as the logs name it, and its name in the network of each.
+
+    InputError if there is none, or if a log holds no states of it.
+    """
+    if not paths:
+        raise InputError("no log given; name the log of a drive, as 'bayesrace collect' writes it")
+    logs = {path: log_facts(path) for path in paths}
+    wanted = name or (given.name if given else "")
+    drivers = {path: _driver(path, facts, wanted) for path, facts in logs.items()}
+    return given or _the_car(_cars(logs, drivers)), drivers
+
+
 def _driver(path: Path, facts: LogFacts, name: str) -> str:
     """The name in the network of the car whose messages are read from a log."""
     names = [one for one in facts.names if not name or one == name]
     if len(names) > 1:
         raise InputError(f"{path} holds several cars ({', '.join(names)}); choose one with --name")
     if not names:
-        which = f"car '{name}'" if name else "any car"
-        raise InputError(f"{path} holds no states of {which}; give the log of a drive")
+        found = ", ".join(facts.names) or "no car"
+        raise InputError(
+            f"{path} holds states of {found}"
+            + (f", not of '{name}': give the car that drove with --car, or its name in the network "
+               "with --name" if facts.names else "; give the log of a drive")
+        )  # fmt: skip
     return names[0]
+
+
+def _cars(
+    logs: Mapping[Path, LogFacts], drivers: Mapping[Path, str]
+) -> dict[Path, CarParameters | None]:
+    """The car of each log, recorded or built in."""
+    return {path: facts.car or builtin_cars().get(drivers[path]) for path, facts in logs.items()}
+
+
+def _the_car(cars: Mapping[Path, CarParameters | None]) -> CarParameters:
+    """The only one; InputError if there are several, or none."""
+    car = _common("cars", cars, lambda one: f"'{one.identity}'")
+    if car is None:
+        raise InputError("no file names its car; name it with --car")
+    return car
 
 
 def _common(what: str, named: Mapping[Path, T | None], text: Callable[[T], str]) -> T | None:

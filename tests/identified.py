@@ -1,15 +1,15 @@
 """Drives by pure pursuit, exact, and their logs as instruments would have made them."""
 
 import functools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from msgspec import structs
 from rich.console import Console
 
-from bayesrace.arrays import Floats
 from bayesrace.codegen.build import build
 from bayesrace.codegen.settings import BuildSettings
 from bayesrace.controller.assembly import compiled_controller
@@ -19,7 +19,7 @@ from bayesrace.gp.weights import read_weights
 from bayesrace.integrators import PREDICTION
 from bayesrace.learning.sources import dataset_from_log
 from bayesrace.log import LogWriter
-from bayesrace.messages import STATE, Reading, State, car_key, encode
+from bayesrace.messages import STATE, State, car_key, encode
 from bayesrace.operation.closed_loop import ClosedLoop, Driven, built_in_car
 from bayesrace.operation.collect import collect, room_beside, training_line
 from bayesrace.operation.drive import RunPlan, run_request
@@ -31,16 +31,15 @@ from bayesrace.operation.preparation import (
 )
 from bayesrace.operation.settings import PreparationSettings
 from bayesrace.operation.terminal.terminal import stages_on
+from bayesrace.plant.sensors import SensorPlayer
 from bayesrace.raceline import racing_line
+from bayesrace.sensors import BUILT_IN, Sensors
 from bayesrace.vehicles import CarParameters, car_text, get_car
 
-__all__ = ["GYRO_NOISE", "GYRO_OFFSET", "TRIM", "exact", "plain", "prepared_for", "raced", "seen"]
+__all__ = ["NOISES", "TRIM", "coasted", "exact", "plain", "poses", "prepared_for", "raced", "seen"]
 
 TRIM = 0.02
 """Steering angle at a commanded angle of 0 [rad]."""
-
-GYRO_OFFSET, GYRO_NOISE = 0.05, 0.02
-"""Of the yaw rate [rad/s]."""
 
 
 @functools.cache
@@ -66,40 +65,65 @@ def exact(name: str, duration_s: float, seed: int = 1, scale: float | None = Non
     return loop.drive(0, duration_s, x0=[*start[:6], TRIM])
 
 
+def poses(mm: float, degrees: float, rate_hz: float) -> Sensors:
+    """Poses that are 20 ms late, but in gaps of 100 ms every 2 s, and 1 % of them far off."""
+    position = {"deviation": 1e-3 * mm, "outlier": 0.3}
+    heading = {"deviation": float(np.deg2rad(degrees)), "outlier": 0.3}
+    pose = {
+        "rate_hz": rate_hz, "delay_s": 0.02, "jitter_s": 0.005, "gap_s": 0.1, "gap_every_s": 2.0,
+        "outliers": 0.01, "x_m": position, "y_m": position, "heading_rad": heading,
+    }  # fmt: skip
+    return Sensors.model_validate({"pose": pose})
+
+
 def seen(
     driven: Driven,
     path: Path,
-    mm: float,
-    degrees: float,
-    *,
-    stamped: bool = True,
-    gyro: bool = False,
-    pose: bool = True,
+    sensors: Sensors,
+    late_s: Mapping[str, float] | None = None,
     count: int | None = None,
-    seed: int = 0,
 ) -> Path:
-    """The log of a drive of which poses are reported a period late, but in gaps of 100 ms every
-    2 s, and 1 % of them nowhere near.
+    """The log of a drive, or of so many states of it, as instruments would have made it.
 
-    ``stamped``: with the time at which they were measured. ``gyro``: of whose readings the times
-    are a period late. ``count``: of states.
+    ``late_s``: by how much later than true each instrument says that it has measured.
     """
-    random = np.random.default_rng(seed)
-    deviation = np.array([1e-3 * mm, 1e-3 * mm, np.deg2rad(degrees)])
-    late_s = driven.step_s if stamped else 0.0
+    player, late_s = SensorPlayer(sensors), late_s or {}
     with _log(path, driven) as write:
-        before = [None, *driven.true_x]
-        for state, x in zip(driven.states[:count], before, strict=False):
-            readings: list[Reading] = []
-            if x is not None and pose and (state.time_s + 1) % 2 > 0.1:
-                value = random.normal(x[:3], deviation)
-                value += (random.random() < 0.01) * random.normal(0, 0.3, 3)
-                readings = [reading("pose", state.time_s - late_s, "x y psi", value, deviation)]
-            if x is not None and gyro:
-                turn = np.array([random.normal(x[5] + GYRO_OFFSET, GYRO_NOISE)])
-                readings.append(reading("gyro", state.time_s, "omega", turn, [0.05]))
-            write(structs.replace(state, x=(0.0,) * 7, estimated=True, readings=tuple(readings)))
+        for state, x in list(zip(driven.states, driven.true_x, strict=False))[:count]:
+            readings = tuple(
+                structs.replace(one, time_s=one.time_s + late_s.get(one.instrument, 0.0))
+                for one in player.report(state.time_s, x)
+            )
+            write(structs.replace(state, x=(0.0,) * 7, estimated=True, readings=readings))
     return path
+
+
+NOISES = {
+    "0.5 mm, 50 Hz": poses(0.5, 0.2, 50),
+    "0.5 mm, 100 Hz": poses(0.5, 0.2, 100),
+    "1 mm, 50 Hz": poses(1.0, 0.5, 50),
+    "1 mm, 100 Hz": poses(1.0, 0.5, 100),
+    "odometry": Sensors(BUILT_IN["odometry"].root | poses(0.5, 0.2, 25).root),
+}
+"""Instruments by a short name: poses of 0.5 mm and 0.2 degrees, or of 1 mm and 0.5 degrees; and few
+of them beside wheel speed and gyro."""
+
+
+def coasted(duration_s: float) -> Driven:
+    """An orca in a wide bend that is not driven but alternates full throttle, up to nearly its top
+    speed, and coasting, down to walking pace."""
+    driven = exact("orca", 12.0)
+    car, random = built_in_car(driven.car), np.random.default_rng(0)
+    car.reset([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, TRIM])
+    states, true_x, throttle, aim = [driven.states[0]], [tuple(car.x.tolist())], 1.0, TRIM
+    for seq in range(1, round(duration_s / driven.step_s) + 1):
+        throttle = 0.0 if car.x[3] > 3.9 else 1.0 if car.x[3] < 1.0 else throttle
+        aim = 0.8 * aim + random.normal(0.01, 0.02)
+        car.step((throttle, float(np.clip((aim - car.x[6]) / driven.step_s, -5, 5))))
+        made = {"seq": states[0].seq + seq, "time_s": car.time_s, "u_applied": car.u_applied}
+        states.append(structs.replace(driven.states[1], **made))
+        true_x.append(tuple(car.x.tolist()))
+    return replace(driven, states=states, true_x=true_x)
 
 
 def raced(true: CarParameters, car: CarParameters, folder: Path) -> Driven:
@@ -126,16 +150,6 @@ def plain(driven: Driven, path: Path, u: tuple[float, float] | None = (0.0, 0.0)
             acted = driven.states[k // 2].u_applied if u is None else u
             write(state if acted == (0.0, 0.0) else structs.replace(state, u_applied=acted))
     return path
-
-
-def reading(
-    instrument: str, time_s: float, of: str, value: Floats, deviation: Sequence[float] | Floats
-) -> Reading:
-    """One with such values."""
-    pairs = zip(value.tolist(), map(float, deviation), strict=True)
-    return Reading(
-        instrument=instrument, time_s=time_s, values=dict(zip(of.split(), pairs, strict=True))
-    )
 
 
 @contextmanager

@@ -226,7 +226,7 @@ def test_a_car_under_another_name_is_known_by_its_log(
     with pytest.raises(InputError, match="--car"):
         read_samples([unnamed])
     assert same(read_samples([unnamed], car=CAR).dataset, other)
-    with pytest.raises(InputError, match="no states of car 'blue'"):
+    with pytest.raises(InputError, match="states of red, not of 'blue'"):
         read_samples([named], name="blue")
 
 

@@ -80,22 +80,22 @@ def identify(
     each with its standard error. The drives excite both inputs, as those of 'collect' do.
     """
     from bayesrace.learning.identification import identify as identified_of
-    from bayesrace.learning.instruments import driven_car, read_runs
+    from bayesrace.learning.instruments import read_drives
+    from bayesrace.learning.sources import recorded_car
     from bayesrace.operation.terminal import tables
     from bayesrace.operation.terminal.terminal import Terminal
     from bayesrace.vehicles import get_car, write_car
 
-    parameters, wanted = driven_car(logs, get_car(car) if car else None, name)
+    parameters, drivers = recorded_car(logs, get_car(car) if car else None, name)
     with options.stages_shown() as stages, stages.stage("identify the car") as stage:
-        runs, instruments = read_runs(logs, wanted)
-        found = identified_of(
-            parameters, runs, instruments, wheelbase=wheelbase, progress=stage.update
-        )
+        drives = read_drives(drivers)
+        found = identified_of(parameters, drives, wheelbase=wheelbase, progress=stage.update)
     if picture is not None:
         from bayesrace.operation.report.identification import write_comparison
 
         write_comparison(found.comparison, found.car, picture)
-    write_car(out, found.car, found.remarks([path.name for path in logs]))
+    remarks, of_sensors = found.remarks([path.name for path in logs]), found.sensor_remarks()
+    write_car(out, found.car, remarks, of_sensors)
     tables.print_identified(found, Terminal())
     typer.echo(f"{out}")
 

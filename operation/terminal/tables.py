@@ -271,8 +271,7 @@ def print_identified(found: "Identified", console: Console) -> None:
     console.print(table)
     text = f"{found.used_s:.1f} s of {found.driven_s:.1f} s driven are used"
     console.print(Text(f"{text}; {found.refused} readings are far from all others"))
-    if not found.limit:
-        text = "friction: this drive did not reach the limit of the tyres; drive faster for it"
+    for text in found.unknown:
         console.print(Text(text, style="yellow"))
 
 
