@@ -14,8 +14,10 @@ from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
 import numpy as np
+from pydantic import ValidationError
 
 from bayesrace.arrays import Floats
+from bayesrace.errors import faults_in
 from bayesrace.learning.instruments import WHOLE, Drives
 from bayesrace.learning.settings import Progress
 from bayesrace.learning.single_track import TYRES, Cars
@@ -149,7 +151,7 @@ class _Report:
         known = {one.name: one for one in values}
         if "cr2" in known and known["cr2"].error > _UNSURE * known["cr2"].value:
             unknown.append(_unsure(known["cr2"]))
-        sensors, measured = self._sensors()
+        sensors, measured = self._sensors(unknown)
         changes: dict[str, object] = {"friction": round(friction.value, 4), "sensors": sensors}
         if isinstance(car.drive, DcMotor):
             numbers = {name: float(f"{known[name].value:.5g}") for name in car.drive.numbers()}
@@ -195,8 +197,8 @@ class _Report:
         }
         return [self._value(key, *row) for key, row in rows.items() if key in self._found]
 
-    def _sensors(self) -> tuple[Sensors, list[Value]]:
-        """Those of the file, with what was found of those that were logged."""
+    def _sensors(self, unknown: list[str]) -> tuple[Sensors, list[Value]]:
+        """Those of the file, with what was found of those that were logged, if they will do."""
         values: list[Value] = []
         sensors = self._car.sensors.model_dump()
         for number, name in enumerate(self._instruments):
@@ -211,7 +213,12 @@ class _Report:
                 timing, of_timing = self._timing(number)
                 sensors[name] = given | found | timing
                 values += of_timing
-        return Sensors.model_validate(sensors), values
+        try:
+            return Sensors.model_validate(sensors), values
+        except ValidationError as error:
+            faults = faults_in(error, "[sensors]", Sensors)
+            unknown.append(f"sensors are not written, as no car's file can have them: {faults}")
+        return self._car.sensors, values
 
     def _channel(self, number: int, of: int) -> tuple[dict[str, float], list[Value]]:
         """Noise and offset of one quantity, by the names of a file."""

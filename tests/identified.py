@@ -82,12 +82,14 @@ def seen(
     sensors: Sensors,
     late_s: Mapping[str, float] | None = None,
     count: int | None = None,
+    seed: int = 0,
 ) -> Path:
     """The log of a drive, or of so many states of it, as instruments would have made it.
 
-    ``late_s``: by how much later than true each instrument says that it has measured.
+    ``late_s``: by how much later than true each instrument says that it has measured; ``seed``: of
+    their errors.
     """
-    player, late_s = SensorPlayer(sensors), late_s or {}
+    player, late_s = SensorPlayer(sensors, seed), late_s or {}
     with _log(path, driven) as write:
         for state, x in list(zip(driven.states, driven.true_x, strict=False))[:count]:
             readings = tuple(
@@ -109,16 +111,16 @@ NOISES = {
 of them beside wheel speed and gyro."""
 
 
-def coasted(duration_s: float) -> Driven:
-    """An orca in a wide bend that is not driven but alternates full throttle, up to nearly its top
-    speed, and coasting, down to walking pace."""
+def coasted(duration_s: float, slowest_mps: float) -> Driven:
+    """An orca in a wide bend that alternates full throttle, up to nearly its top speed, and
+    coasting, down to the slowest."""
     driven = exact("orca", 12.0)
     car, random = built_in_car(driven.car), np.random.default_rng(0)
     car.reset([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, TRIM])
     states, true_x, throttle, aim = [driven.states[0]], [tuple(car.x.tolist())], 1.0, TRIM
     for seq in range(1, round(duration_s / driven.step_s) + 1):
-        throttle = 0.0 if car.x[3] > 3.9 else 1.0 if car.x[3] < 1.0 else throttle
-        aim = 0.8 * aim + random.normal(0.01, 0.02)
+        throttle = 0.0 if car.x[3] > 3.9 else 1.0 if car.x[3] < slowest_mps else throttle
+        aim = 0.8 * aim + random.normal(0.005, 0.01)
         car.step((throttle, float(np.clip((aim - car.x[6]) / driven.step_s, -5, 5))))
         made = {"seq": states[0].seq + seq, "time_s": car.time_s, "u_applied": car.u_applied}
         states.append(structs.replace(driven.states[1], **made))
