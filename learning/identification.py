@@ -20,12 +20,12 @@ from bayesrace.arrays import Floats
 from bayesrace.errors import faults_in
 from bayesrace.learning.instruments import WHOLE, Drives
 from bayesrace.learning.settings import Progress
-from bayesrace.learning.single_track import TYRES, Cars
+from bayesrace.learning.single_track import TYRES, Cars, Numbers
 from bayesrace.learning.window_fit import Fit, polynomials, states_of
 from bayesrace.messages import QUANTITIES
 from bayesrace.sensors import FIELDS, Sensors
 from bayesrace.vehicles import CarParameters
-from bayesrace.vehicles.parts import GRAVITY_MPS2, DcMotor
+from bayesrace.vehicles.parts import GRAVITY_MPS2, DcMotor, Pacejka
 
 __all__ = ["Comparison", "Identified", "Value", "identify"]
 
@@ -111,15 +111,18 @@ def identify(
     drives: Drives,
     *,
     wheelbase: bool = False,
+    tyres: bool = False,
     progress: Progress | None = None,
 ) -> Identified:
     """Finds the numbers of a car; ``car`` has its geometry and mass, and where to begin.
 
-    ``wheelbase``: it is not known, either; then the steering's gain is 1. InputError if there is
-    too little driving, if the commands hardly change, or if no such car drove.
+    ``wheelbase``: it is not known, either; then the steering's gain is 1. ``tyres``: the car found
+    has tyres and yaw inertia, in place of those of ``car``, if any, so that it can be simulated.
+    InputError if there is too little driving, if the commands hardly change, or if no such car
+    drove.
     """
     fits = [
-        Fit(car.model_copy(update={"tyres": tyres}), drives, wheelbase=wheelbase) for tyres in TYRES
+        Fit(car.model_copy(update={"tyres": model}), drives, wheelbase=wheelbase) for model in TYRES
     ]
     for number, (window_s, close) in enumerate(_ROUNDS):
         if number == _CHOICE:
@@ -129,7 +132,7 @@ def identify(
         if progress is not None:
             progress((number + 1) / len(_ROUNDS), "")
     fits[0].check()
-    return _Report(car, fits[0]).identified()
+    return _Report(car, fits[0]).identified(tyres=tyres)
 
 
 class _Report:
@@ -143,7 +146,7 @@ class _Report:
         numbers, _ = fit.numbers(fit.theta[None])
         self._motion = fit.track.drive(numbers, fit.windows, fit.states[None])
 
-    def identified(self) -> Identified:
+    def identified(self, *, tyres: bool) -> Identified:
         """All of it."""
         fit, car = self._fit, self._car
         friction, unknown = self._friction()
@@ -159,6 +162,8 @@ class _Report:
         if "wheelbase" in known:
             share = known["wheelbase"].value / car.wheelbase_m
             changes |= {one: float(f"{share * getattr(car, one):.5g}") for one in ("lf_m", "lr_m")}
+        if tyres:
+            changes |= self._tyres()
         return Identified(
             car=CarParameters.model_validate(car.model_dump(exclude_unset=True) | changes),
             values=(*values, *measured),
@@ -196,6 +201,19 @@ class _Report:
             "size": ("wheelbase", "m", "lf + lr", self._car.wheelbase_m),
         }
         return [self._value(key, *row) for key, row in rows.items() if key in self._found]
+
+    def _tyres(self) -> dict[str, object]:
+        """With the yaw inertia, of the model that was found."""
+        found = Numbers(*self._fit.numbers(self._fit.theta[None])[0][0])
+        numbers = {k: float(f"{v:.5g}") for k, v in found.equation_numbers(self._car).items()}
+        numbers["height_m"] = max(numbers["height_m"], 0.0)
+        tyres: dict[str, Any] = {}
+        for name, part in self._fit.car.tyres or ():
+            if isinstance(part, Pacejka):
+                tyres[name] = {k: numbers[f"{name}_{k}"] for k, _ in part}
+            else:
+                tyres[name] = numbers.get(name, part)
+        return {"tyres": tyres, "inertia_kgm2": numbers["inertia_kgm2"]}
 
     def _sensors(self, unknown: list[str]) -> tuple[Sensors, list[Value]]:
         """Those of the file, with what was found of those that were logged, if they will do."""

@@ -48,10 +48,9 @@ def near(found: Identified, name: str, true: float, share: float = 0.03) -> None
 
 
 @functools.cache
-def skid_pad() -> float:
-    """Largest lateral acceleration of an orca over g on slowly rising throttle, the steering held
-    at 70 % of its range."""
-    car = get_car("orca")
+def skid_pad(car: CarParameters) -> float:
+    """Largest lateral acceleration of a car like the orca over g on slowly rising throttle, the
+    steering held at 70 % of its range."""
     pad, delta, best = built_in_car(car), 0.7 * car.delta_max_rad, 0.0
     pad.reset([0.0, 0.0, 0.0, 0.5, 0.0, 0.5 * delta / car.wheelbase_m, delta])
     for step in range(4000):
@@ -70,12 +69,15 @@ def check_found(name: str, noise: str, folder: Path, seed: int, duration_s: floa
     found, numbers = found_in(log, car=guess(driven.car)), driven.car.drive.numbers()
     true = {"delay": 27.0, "steering offset": TRIM, "steering gain": 1.0}
     if name == "orca":
-        true |= {one: numbers[one] for one in ("cm1", "cm2", "cr0")} | {"friction": skid_pad()}
+        true |= {one: numbers[one] for one in ("cm1", "cm2", "cr0")} | {
+            "friction": skid_pad(driven.car)
+        }
     else:
         true |= {"drive gain": 1.0}
     for what, number in true.items():
         near(found, what, number)
     assert any("limit of the tyres" in one for one in found.unknown) == (name != "orca")
+    assert found.car.tyres is None
 
 
 def test_an_orca_is_found_from_poses(tmp_path: Path) -> None:
@@ -183,12 +185,14 @@ def test_the_command_writes_a_file_that_all_others_read(cli: Cli, tmp_path: Path
     log = plain(exact("orca", 12.0), tmp_path / "drive.mcap")
     start = tmp_path / "mine.toml"
     write_car(start, guess(get_car("orca")))
-    outcome = cli("identify", log, "--car", start, "--picture", "seen.png", "--wheelbase")
+    given = "--car", start, "--picture", "seen.png", "--wheelbase", "--tyres"
+    outcome = cli("identify", log, *given)
     assert outcome.code == 0, outcome.err
     for word in ("cm1", "std. error", "wheelbase", "state omega", "identified.toml"):
         assert word in outcome.out
     made = read_car(tmp_path / "identified.toml")
-    assert made.tyres is None
+    assert skid_pad(made) == pytest.approx(skid_pad(get_car("orca")), rel=1e-3)
+    assert made.inertia_kgm2 == pytest.approx(get_car("orca").inertia_kgm2, rel=0.01)
     assert made.wheelbase_m == pytest.approx(0.062, rel=0.01)
     assert made.mass_kg == get_car("orca").mass_kg
     assert "# Identified by" in (tmp_path / "identified.toml").read_text()

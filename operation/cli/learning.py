@@ -72,6 +72,7 @@ def identify(
     out: Path = options.out_file(Path("identified.toml")),
     picture: Path | None = options.new_file("Draw accelerations, measured and modelled (PNG)."),
     wheelbase: bool = options.flag("--wheelbase", "Find the wheelbase, too; steering gain is 1."),
+    tyres: bool = options.flag("--tyres", "Write tyres and yaw inertia, too, to simulate the car."),
     name: str = options.CAR_NAME,
 ) -> None:
     """Identify a car from drives: what its file needs and a ruler does not measure.
@@ -89,7 +90,9 @@ def identify(
     parameters, drivers = recorded_car(logs, get_car(car) if car else None, name)
     with options.stages_shown() as stages, stages.stage("identify the car") as stage:
         drives = read_drives(drivers)
-        found = identified_of(parameters, drives, wheelbase=wheelbase, progress=stage.update)
+        found = identified_of(
+            parameters, drives, wheelbase=wheelbase, tyres=tyres, progress=stage.update
+        )
     if picture is not None:
         from bayesrace.operation.report.identification import write_comparison
 
