@@ -10,7 +10,7 @@ count as right; those of others are compared with it.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -64,7 +64,7 @@ class Value(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Mean accelerations in windows: of parabolas through their poses, and as modelled."""
+    """Accelerations in windows, of parabolas through measured poses and through modelled ones."""
 
     speed_mps: Floats
     command: Floats
@@ -176,6 +176,7 @@ class _Report:
 
     def _value(self, key: str, name: str, unit: str, meaning: str, times: float = 1.0) -> Value:
         value, error = self._found[key]
+        value = 0.0 if abs(value) < 1e-6 * error else value  # at a bound
         return Value(name, times * float(value), times * float(error), unit, meaning)
 
     def _values(self) -> list[Value]:
@@ -277,12 +278,13 @@ class _Report:
             delay_s += late.value / 1e3
         delay_s = min(max(delay_s, 0.0), 1.0)
         waiting = period_s**2 / 12 * (1 - 1 / moments**2)
-        jitter_s = min(float(np.sqrt(3 * max(0.0, age_s.var() - waiting))), delay_s)
-        for what, one, about in (
+        jitter_s = min(float(np.sqrt(3 * max(0.0, round(age_s.var() - waiting, 9)))), delay_s)
+        for what, span_s, about in (
             ("delay", delay_s, "measurement to report"), ("jitter", jitter_s, "of the delay")
         ):  # fmt: skip
-            values.append(Value(f"{name} {what}", 1e3 * one, 1e3 * error_s, "ms", about, name))
-        return _rounded({"rate_hz": rate_hz, "delay_s": delay_s, "jitter_s": jitter_s}), values
+            values.append(Value(f"{name} {what}", 1e3 * span_s, 1e3 * error_s, "ms", about, name))
+        found = {"rate_hz": rate_hz, "delay_s": delay_s, "jitter_s": jitter_s}
+        return {one: round(number, 5) for one, number in found.items()}, values
 
     def _accelerations(self) -> Floats:
         """Along the car and to its left in each period of each window, (periods, w, 2)."""
@@ -308,14 +310,18 @@ class _Report:
         return Value("friction", held, spread, "1", about), [remedy]
 
     def _comparison(self) -> Comparison:
-        fit, length_s = self._fit, self._fit.periods * self._fit.drives.step_s
-        curves, _ = polynomials(fit.windows, 2, length_s)
-        x, command = states_of(curves, 0.5, length_s), fit.track.commands(fit.windows)[0]
-        xx, yy = 2 * curves[:2, :, 2] / length_s**2
-        cos, sin = np.cos(x[:, 2]), np.sin(x[:, 2])
-        measured = np.column_stack([xx * cos + yy * sin, yy * cos - xx * sin])
-        both = measured[fit.used], self._accelerations().mean(axis=0)[fit.used]
-        return Comparison(x[fit.used, 3], command[fit.used].mean(axis=1), *both)
+        fit, windows = self._fit, self._fit.windows
+        one, said = windows.readings, windows.readings.copy()
+        deviation = fit.noise[one["instrument"], one["of"]] / windows.weight.clip(1e-12)
+        said["value"] -= fit.linearised(numbers=False)[0] * deviation
+        length_s, both = fit.periods * fit.drives.step_s, []
+        for readings in (one, said):
+            curves, _ = polynomials(replace(windows, readings=readings), 2, length_s)
+            x, (xx, yy) = states_of(curves, 0.5, length_s), 2 * curves[:2, :, 2] / length_s**2
+            cos, sin = np.cos(x[:, 2]), np.sin(x[:, 2])
+            both.append(np.column_stack([xx * cos + yy * sin, yy * cos - xx * sin])[fit.used])
+        command = fit.track.commands(windows)[0].mean(axis=1)
+        return Comparison(x[fit.used, 3], command[fit.used], *both)
 
 
 def _rounded(found: dict[str, float]) -> dict[str, float]:
