@@ -230,7 +230,6 @@ static void foresee(br_cycle *cycle) {
  * they have not shown of the car's step is no error of whatever weights. Without weights q is what
  * is not known of the acceleration. */
 static br_mpc_noise noise_of(const br_cycle *cycle, const br_estimate *now, double duration_s) {
-    static const int corrects[BR_NE] = {BR_INDEX_VX, BR_INDEX_VY, BR_INDEX_OMEGA};
     const br_estimator *estimator = &cycle->estimator;
     br_mpc_noise noise;
     double added[BR_NX];
@@ -238,9 +237,9 @@ static br_mpc_noise noise_of(const br_cycle *cycle, const br_estimate *now, doub
         added[i] = duration_s * estimator->settings.drift[i] * estimator->settings.drift[i];
     for (int j = 0; j < BR_NE; ++j) {
         if (estimator->walks)
-            added[corrects[j]] += duration_s * duration_s * now->p[BR_NB + j][BR_NB + j];
+            added[BR_RATE[j]] += duration_s * duration_s * now->p[BR_NB + j][BR_NB + j];
         else if (cycle->has_variance)
-            added[corrects[j]] += duration_s / BR_TS * cycle->variance[j];
+            added[BR_RATE[j]] += duration_s / BR_TS * cycle->variance[j];
     }
     for (int i = 0; i < BR_NX; ++i) {
         const double corrected = estimator->corrected[i], predicted = now->p[i][i] + corrected;

@@ -14,16 +14,11 @@
 
 #if BR_HAS_PATH
 
-#define SAME_S 1e-9    /* times closer than that are one */
 #define LONGEST_S 1.0  /* without position, or between two periods; after that it begins anew */
 #define BEGINNING 0.25 /* share of the gate until a second pose has agreed with the first */
 #define WIDEST 100.0   /* by how much one measurement may widen the covariance */
 #define APART_S 0.2    /* between two poses whose difference is a velocity */
 #define STEERED 4.0    /* so many times the steering angle's deviation has a car that moves */
-
-/* The states that the residuals correct. */
-static const int RATE[] = {BR_INDEX_VX, BR_INDEX_VY, BR_INDEX_OMEGA};
-_Static_assert(sizeof RATE / sizeof RATE[0] == BR_NE, "a state for each residual");
 
 /* Chi-squared that one of 1,000 exceeds, by degrees of freedom from 1 on. */
 static const double EXCEEDED[] = {10.828, 13.816, 16.266, 18.467, 20.515, 22.458, 24.322};
@@ -70,121 +65,6 @@ void br_estimator_reset(br_estimator *estimator) {
     if (!estimator) return;
     estimator->count = estimator->latched = 0;
     for (int i = 0; i < BR_INSTRUMENTS; ++i) br_instrument_restart(&estimator->instrument[i]);
-}
-
-/* --- between two events --- */
-
-/* P <- F P F' + Q, where what is beside the states stays. */
-static void spread(const double jacobian[BR_NX * BR_NX],
-                   const double by_acceleration[BR_NX * BR_NE], const double q[BR_NX * BR_NX],
-                   br_estimate *b) {
-    double f[BR_NX][BR_NA] = {{0}}, fp[BR_NX][BR_NA];
-    const int n = b->count;
-    for (int i = 0; i < BR_NX; ++i) {
-        for (int l = 0; l < BR_NX; ++l) f[i][l] = jacobian[BR_NX * i + l];
-        for (int j = 0; j < n - BR_NB; ++j) f[i][BR_NB + j] = by_acceleration[BR_NE * i + j];
-        for (int j = 0; j < n; ++j) {
-            fp[i][j] = 0;
-            for (int l = 0; l < BR_NX; ++l) fp[i][j] += f[i][l] * b->p[l][j];
-            for (int l = BR_NB; l < n; ++l) fp[i][j] += f[i][l] * b->p[l][j];
-        }
-    }
-    for (int i = 0; i < BR_NX; ++i) {
-        for (int j = i; j < BR_NX; ++j) {
-            double sum = q[BR_NX * i + j];
-            for (int l = 0; l < BR_NX; ++l) sum += fp[i][l] * f[j][l];
-            for (int l = BR_NB; l < n; ++l) sum += fp[i][l] * f[j][l];
-            b->p[i][j] = b->p[j][i] = sum;
-        }
-        for (int j = BR_NX; j < n; ++j) b->p[i][j] = b->p[j][i] = fp[i][j];
-    }
-}
-
-/* The yaw acceleration of a car that follows its steering angle, with a lag, as a car that
- * understeers does in the end; and how it changes with the state. */
-static double steered(const br_estimation *s, const double x[BR_NX], double duration,
-                      double slope[BR_NX]) {
-    const double v = fmax(x[BR_INDEX_VX], 0), angle = x[BR_INDEX_DELTA];
-    const double base = BR_WHEELBASE_M + s->understeer * v * v;
-    const double share = (1 - exp(-duration / s->yaw_lag_s)) / duration;
-    memset(slope, 0, BR_NX * sizeof(double));
-    slope[BR_INDEX_VX] = share * angle * (BR_WHEELBASE_M - s->understeer * v * v) / (base * base);
-    slope[BR_INDEX_DELTA] = share * v / base;
-    slope[BR_INDEX_OMEGA] = -share;
-    return share * (v * angle / base - x[BR_INDEX_OMEGA]);
-}
-
-/* As br_mpc_propagate, where accelerations move the car: along it beside the model, which knows the
- * motor, else in its place, because by the model a wheel that is turned moves the car at once. */
-static br_mpc_error walk(const br_estimator *estimator, const br_estimate *b, const double u[BR_NU],
-                         double duration, double next[BR_NX], double f[BR_NX * BR_NX],
-                         double by[BR_NX * BR_NE], double q[BR_NX * BR_NX]) {
-    double lacking[BR_NE], turning[BR_NX];
-    const br_mpc *mpc = estimator->mpc;
-    const double *x = b->x, *acceleration = b->x + BR_NB;
-    br_mpc_error error = br_mpc_propagate(mpc, x, x, u, duration, NULL, NULL, next, f, by, q);
-    for (int j = 0; j < BR_NE; ++j) {
-        lacking[j] = acceleration[j];
-        if (RATE[j] != BR_INDEX_VX) lacking[j] += (x[RATE[j]] - next[RATE[j]]) / duration;
-        if (RATE[j] == BR_INDEX_OMEGA)
-            lacking[j] += steered(&estimator->settings, x, duration, turning);
-    }
-    if (!error) error = br_mpc_propagate(mpc, x, x, u, duration, NULL, lacking, next, f, by, q);
-    if (error) return error;
-    double changed[BR_NE][BR_NX] = {{0}}; /* of what is lacking, with x */
-    for (int j = 0; j < BR_NE; ++j)
-        for (int l = 0; RATE[j] != BR_INDEX_VX && l < BR_NX; ++l)
-            changed[j][l] = ((l == RATE[j]) - f[BR_NX * RATE[j] + l]) / duration +
-                            (RATE[j] == BR_INDEX_OMEGA ? turning[l] : 0);
-    for (int i = 0; i < BR_NX; ++i)
-        for (int l = 0; l < BR_NX; ++l)
-            for (int j = 0; j < BR_NE; ++j) f[BR_NX * i + l] += by[BR_NE * i + j] * changed[j][l];
-    return BR_OK;
-}
-
-/* Accelerations after a duration: less of what they were, and something new. */
-static void fade(const br_estimation *settings, double duration, br_estimate *b) {
-    const double left = exp(-duration / settings->acceleration_s);
-    for (int i = BR_NB; i < BR_NA; ++i) {
-        const double deviation = settings->acceleration[i - BR_NB];
-        b->x[i] *= left;
-        for (int l = 0; l < BR_NA; ++l) b->p[i][l] = b->p[l][i] = left * b->p[i][l];
-        b->p[i][i] = left * b->p[i][i] + (1 - left * left) * deviation * deviation;
-    }
-}
-
-/* x and P after a duration of at most a stage, under u. The residual is that of where the period
- * began, by what is believed now: taken anew at each measurement it would run ahead of the car. */
-static br_mpc_error propagate(const br_estimator *estimator, const double u[BR_NU],
-                              const double variance[BR_NE], double duration, br_estimate *b) {
-    double f[BR_NX * BR_NX], by[BR_NX * BR_NE], q[BR_NX * BR_NX], begin[BR_NX], next[BR_NX];
-    for (int i = 0; i < BR_NX; ++i) begin[i] = b->x[i] - b->way[i];
-    const br_mpc_error error = estimator->walks
-                                   ? walk(estimator, b, u, duration, next, f, by, q)
-                                   : br_mpc_propagate(estimator->mpc, b->x, begin, u, duration,
-                                                      variance, NULL, next, f, by, q);
-    if (error) return error;
-    for (int i = 0; i < BR_NX; ++i) {
-        b->way[i] += next[i] - b->x[i];
-        b->x[i] = next[i];
-    }
-    spread(f, by, q, b);
-    const br_estimation *s = &estimator->settings;
-    for (int i = 0; i < BR_NB; ++i)
-        if (i < BR_NX || s->start[i] > 0) b->p[i][i] += duration * s->drift[i] * s->drift[i];
-    if (estimator->walks) fade(s, duration, b);
-    return BR_OK;
-}
-
-br_mpc_error br_estimator_reach(const br_estimator *estimator, const double u[BR_NU],
-                                const double variance[BR_NE], double duration, br_estimate *b) {
-    br_mpc_error error = BR_OK;
-    for (; duration > BR_TS + SAME_S && !error; duration -= BR_TS) {
-        error = propagate(estimator, u, variance, BR_TS, b);
-        memset(b->way, 0, sizeof b->way);
-    }
-    if (error || duration < SAME_S) return error;
-    return propagate(estimator, u, variance, fmin(duration, BR_TS), b);
 }
 
 /* --- a measurement --- */
@@ -350,7 +230,7 @@ static void begin_moving(const br_measurement *before, const br_measurement *m, 
     b->x[BR_INDEX_OMEGA] = dpsi / dt;
     b->x[BR_INDEX_DELTA] =
         atan2(BR_WHEELBASE_M * b->x[BR_INDEX_OMEGA], fmax(b->x[BR_INDEX_VX], BR_WHEELBASE_M / dt));
-    for (int j = 0; j < BR_NE; ++j) b->p[RATE[j]][RATE[j]] += noise / (dt * dt);
+    for (int j = 0; j < BR_NE; ++j) b->p[BR_RATE[j]][BR_RATE[j]] += noise / (dt * dt);
     b->p[BR_INDEX_DELTA][BR_INDEX_DELTA] *= STEERED * STEERED;
 }
 
@@ -366,7 +246,7 @@ static void keep_steering(const br_estimate *known, br_estimate *b) {
 /* What was believed when this was measured; NULL: nothing. */
 static const br_estimate *believed_at(br_estimator *estimator, double time_s) {
     int k = estimator->count - 1;
-    while (k >= 0 && br_estimator_event(estimator, k)->time_s > time_s + SAME_S) --k;
+    while (k >= 0 && br_estimator_event(estimator, k)->time_s > time_s + BR_SAME_S) --k;
     return k < 0 ? NULL : &br_estimator_event(estimator, k)->after;
 }
 
@@ -406,8 +286,8 @@ static void begin(br_estimator *estimator, const br_measurement *m, const br_mea
 static int place(br_estimator *estimator, const br_measurement *m) {
     const int last = estimator->count - 1;
     if (!valid(m)) return -1;
-    if (m->time_s > br_estimator_event(estimator, last)->time_s + SAME_S ||
-        m->time_s < br_estimator_event(estimator, 0)->time_s - SAME_S)
+    if (m->time_s > br_estimator_event(estimator, last)->time_s + BR_SAME_S ||
+        m->time_s < br_estimator_event(estimator, 0)->time_s - BR_SAME_S)
         return -1;
     int k = last;
     while (k > 1 && br_estimator_event(estimator, k - 1)->time_s > m->time_s) --k;
@@ -429,7 +309,7 @@ static void lose(br_estimator *estimator, const br_measurement *m, double time_s
     br_instrument *instrument = &estimator->instrument[m->instrument];
     const int early = estimator->count < BR_EVENTS && m->time_s >= time_s - LONGEST_S;
     instrument->lost += 1;
-    if (m->time_s <= time_s + SAME_S && early && valid(m)) return;
+    if (m->time_s <= time_s + BR_SAME_S && early && valid(m)) return;
     br_instrument_bad(instrument, BR_FAULT_TIME);
 }
 
@@ -585,11 +465,11 @@ br_mpc_error br_estimator_advance(br_estimator *estimator, double time_s, const 
     if (!estimator->has_settings) return BR_ERROR_NOT_READY;
     if (!isfinite(time_s)) return BR_ERROR_TIME;
     const int begun = estimator->count;
-    if (begun && time_s < br_estimator_event(estimator, begun - 1)->time_s - SAME_S) {
+    if (begun && time_s < br_estimator_event(estimator, begun - 1)->time_s - BR_SAME_S) {
         estimator->count = 0; /* one of the two dates is wrong */
         return BR_ERROR_TIME;
     }
-    const br_measurement *pose = first_pose(estimator, measurements, count, time_s + SAME_S);
+    const br_measurement *pose = first_pose(estimator, measurements, count, time_s + BR_SAME_S);
     const int anew = !begun || outdated(estimator, time_s, pose != NULL);
     if (anew && (!pose || estimator->latched)) {
         estimator->count = 0;
@@ -603,7 +483,8 @@ br_mpc_error br_estimator_advance(br_estimator *estimator, double time_s, const 
     br_mpc_error error = period(estimator, &end, measurements, count, anew ? pose : NULL);
     const br_measurement before = estimator->pose;
     const double apart_s = pose && !anew ? pose->time_s - before.time_s : 0;
-    if (!error && estimator->astray > 1 && apart_s > SAME_S) { /* not at rest, nor where it began */
+    if (!error && estimator->astray > 1 &&
+        apart_s > BR_SAME_S) { /* not at rest, nor where it began */
         begin(estimator, pose, apart_s < APART_S ? &before : NULL);
         error = period(estimator, &end, measurements, count, pose);
     }

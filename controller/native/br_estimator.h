@@ -4,7 +4,14 @@
 
 #include "bayesrace_estimator.h"
 
+#define BR_SAME_S 1e-9        /* times closer than that are one */
 #define BR_NA (BR_NB + BR_NE) /* with accelerations */
+
+#if BR_HAS_PATH
+/* The states that the residuals correct. */
+static const int BR_RATE[] = {BR_INDEX_VX, BR_INDEX_VY, BR_INDEX_OMEGA};
+_Static_assert(sizeof BR_RATE / sizeof BR_RATE[0] == BR_NE, "a state for each residual");
+#endif
 
 typedef struct {
     int count; /* of these: BR_NA, or BR_NB without accelerations */
@@ -48,7 +55,8 @@ static inline const br_estimate *br_estimator_now(br_estimator *estimator) {
 /* What is expected of a measured state, its offset included. */
 double br_estimate_observed(const double x[BR_NA], int state);
 
-/* x and P after a duration, under u. */
+/* --- br_motion.c: x and P after a duration, under u --- */
+
 br_mpc_error br_estimator_reach(const br_estimator *estimator, const double u[BR_NU],
                                 const double variance[BR_NE], double duration, br_estimate *b);
 

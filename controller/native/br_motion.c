@@ -1,0 +1,125 @@
+/* How an estimate moves between two events: by the corrected model, or, where nothing corrects it,
+ * by accelerations that are estimated as well (bayesrace_estimator.h).
+ */
+#include "br_estimator.h"
+
+#include <math.h>
+#include <string.h>
+
+#if BR_HAS_PATH
+
+/* P <- F P F' + Q, where what is beside the states stays. */
+static void spread(const double jacobian[BR_NX * BR_NX],
+                   const double by_acceleration[BR_NX * BR_NE], const double q[BR_NX * BR_NX],
+                   br_estimate *b) {
+    double f[BR_NX][BR_NA] = {{0}}, fp[BR_NX][BR_NA];
+    const int n = b->count;
+    for (int i = 0; i < BR_NX; ++i) {
+        for (int l = 0; l < BR_NX; ++l) f[i][l] = jacobian[BR_NX * i + l];
+        for (int j = 0; j < n - BR_NB; ++j) f[i][BR_NB + j] = by_acceleration[BR_NE * i + j];
+        for (int j = 0; j < n; ++j) {
+            fp[i][j] = 0;
+            for (int l = 0; l < BR_NX; ++l) fp[i][j] += f[i][l] * b->p[l][j];
+            for (int l = BR_NB; l < n; ++l) fp[i][j] += f[i][l] * b->p[l][j];
+        }
+    }
+    for (int i = 0; i < BR_NX; ++i) {
+        for (int j = i; j < BR_NX; ++j) {
+            double sum = q[BR_NX * i + j];
+            for (int l = 0; l < BR_NX; ++l) sum += fp[i][l] * f[j][l];
+            for (int l = BR_NB; l < n; ++l) sum += fp[i][l] * f[j][l];
+            b->p[i][j] = b->p[j][i] = sum;
+        }
+        for (int j = BR_NX; j < n; ++j) b->p[i][j] = b->p[j][i] = fp[i][j];
+    }
+}
+
+/* The yaw acceleration of a car that follows its steering angle, with a lag, as a car that
+ * understeers does in the end; and how it changes with the state. */
+static double steered(const br_estimation *s, const double x[BR_NX], double duration,
+                      double slope[BR_NX]) {
+    const double v = fmax(x[BR_INDEX_VX], 0), angle = x[BR_INDEX_DELTA];
+    const double base = BR_WHEELBASE_M + s->understeer * v * v;
+    const double share = (1 - exp(-duration / s->yaw_lag_s)) / duration;
+    memset(slope, 0, BR_NX * sizeof(double));
+    slope[BR_INDEX_VX] = share * angle * (BR_WHEELBASE_M - s->understeer * v * v) / (base * base);
+    slope[BR_INDEX_DELTA] = share * v / base;
+    slope[BR_INDEX_OMEGA] = -share;
+    return share * (v * angle / base - x[BR_INDEX_OMEGA]);
+}
+
+/* As br_mpc_propagate, where accelerations move the car: along it beside the model, which knows the
+ * motor, else in its place, because by the model a wheel that is turned moves the car at once. */
+static br_mpc_error walk(const br_estimator *estimator, const br_estimate *b, const double u[BR_NU],
+                         double duration, double next[BR_NX], double f[BR_NX * BR_NX],
+                         double by[BR_NX * BR_NE], double q[BR_NX * BR_NX]) {
+    double lacking[BR_NE], turning[BR_NX];
+    const br_mpc *mpc = estimator->mpc;
+    const double *x = b->x, *acceleration = b->x + BR_NB;
+    br_mpc_error error = br_mpc_propagate(mpc, x, x, u, duration, NULL, NULL, next, f, by, q);
+    if (error) return error;
+    for (int j = 0; j < BR_NE; ++j) {
+        lacking[j] = acceleration[j];
+        if (BR_RATE[j] != BR_INDEX_VX) lacking[j] += (x[BR_RATE[j]] - next[BR_RATE[j]]) / duration;
+        if (BR_RATE[j] == BR_INDEX_OMEGA)
+            lacking[j] += steered(&estimator->settings, x, duration, turning);
+    }
+    error = br_mpc_propagate(mpc, x, x, u, duration, NULL, lacking, next, f, by, q);
+    if (error) return error;
+    double changed[BR_NE][BR_NX] = {{0}}; /* of what is lacking, with x */
+    for (int j = 0; j < BR_NE; ++j)
+        for (int l = 0; BR_RATE[j] != BR_INDEX_VX && l < BR_NX; ++l)
+            changed[j][l] = ((l == BR_RATE[j]) - f[BR_NX * BR_RATE[j] + l]) / duration +
+                            (BR_RATE[j] == BR_INDEX_OMEGA ? turning[l] : 0);
+    for (int i = 0; i < BR_NX; ++i)
+        for (int l = 0; l < BR_NX; ++l)
+            for (int j = 0; j < BR_NE; ++j) f[BR_NX * i + l] += by[BR_NE * i + j] * changed[j][l];
+    return BR_OK;
+}
+
+/* Accelerations after a duration: less of what they were, and something new. */
+static void fade(const br_estimation *settings, double duration, br_estimate *b) {
+    const double left = exp(-duration / settings->acceleration_s);
+    for (int i = BR_NB; i < BR_NA; ++i) {
+        const double deviation = settings->acceleration[i - BR_NB];
+        b->x[i] *= left;
+        for (int l = 0; l < BR_NA; ++l) b->p[i][l] = b->p[l][i] = left * b->p[i][l];
+        b->p[i][i] = left * b->p[i][i] + (1 - left * left) * deviation * deviation;
+    }
+}
+
+/* x and P after a duration of at most a stage, under u. The residual is that of where the period
+ * began, by what is believed now: taken anew at each measurement it would run ahead of the car. */
+static br_mpc_error propagate(const br_estimator *estimator, const double u[BR_NU],
+                              const double variance[BR_NE], double duration, br_estimate *b) {
+    double f[BR_NX * BR_NX], by[BR_NX * BR_NE], q[BR_NX * BR_NX], begin[BR_NX], next[BR_NX];
+    for (int i = 0; i < BR_NX; ++i) begin[i] = b->x[i] - b->way[i];
+    const br_mpc_error error = estimator->walks
+                                   ? walk(estimator, b, u, duration, next, f, by, q)
+                                   : br_mpc_propagate(estimator->mpc, b->x, begin, u, duration,
+                                                      variance, NULL, next, f, by, q);
+    if (error) return error;
+    for (int i = 0; i < BR_NX; ++i) {
+        b->way[i] += next[i] - b->x[i];
+        b->x[i] = next[i];
+    }
+    spread(f, by, q, b);
+    const br_estimation *s = &estimator->settings;
+    for (int i = 0; i < BR_NB; ++i)
+        if (i < BR_NX || s->start[i] > 0) b->p[i][i] += duration * s->drift[i] * s->drift[i];
+    if (estimator->walks) fade(s, duration, b);
+    return BR_OK;
+}
+
+br_mpc_error br_estimator_reach(const br_estimator *estimator, const double u[BR_NU],
+                                const double variance[BR_NE], double duration, br_estimate *b) {
+    br_mpc_error error = BR_OK;
+    for (; duration > BR_TS + BR_SAME_S && !error; duration -= BR_TS) {
+        error = propagate(estimator, u, variance, BR_TS, b);
+        memset(b->way, 0, sizeof b->way);
+    }
+    if (error || duration < BR_SAME_S) return error;
+    return propagate(estimator, u, variance, fmin(duration, BR_TS), b);
+}
+
+#endif
