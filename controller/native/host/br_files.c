@@ -219,6 +219,8 @@ int br_files_settings(const char *folder, br_mpc_parameters *parameters, br_driv
         {.name = "drift", .number = estimation->drift, .count = BR_NB},
         {.name = "acceleration", .number = estimation->acceleration, .count = BR_NE},
         {.name = "acceleration_s", .number = &estimation->acceleration_s},
+        {.name = "yaw_lag_s", .number = &estimation->yaw_lag_s},
+        {.name = "understeer", .number = &estimation->understeer},
         {.name = "gate", .number = &estimation->gate}};
     const int count = sizeof settings / sizeof settings[0];
     FILE *file = opened(folder, r.name);
