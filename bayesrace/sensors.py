@@ -5,6 +5,7 @@ An instrument measures some of the states at a rate of its own, and reports each
 it says of its errors is their standard deviation; offset, outliers and steps it does not say.
 """
 
+import hashlib
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -142,8 +143,10 @@ class Sensors(RootModel[dict[_Name, Instrument]]):
 
     @property
     def label(self) -> str:
-        """The name of a built-in set, or all values as JSON."""
-        return next((k for k, v in BUILT_IN.items() if v == self), self.model_dump_json())
+        """The name of a built-in set, or what there is with a digest of all values."""
+        rates = ", ".join(f"{name} {one.rate_hz:g} Hz" for name, one in self.root.items())
+        other = f"{rates} ({hashlib.sha256(self.model_dump_json().encode()).hexdigest()[:6]})"
+        return next((k for k, v in BUILT_IN.items() if v == self), other)
 
     def check_rate(self, states_hz: float) -> None:
         """InputError if more readings are made than states can hold."""

@@ -189,6 +189,10 @@ def test_a_car_has_its_own_sensors_and_an_option_overrides_them(tmp_path: Path) 
     assert hash(given) != hash(RaceSettings())
     assert RaceSettings().instruments == EXACT
     assert [one.label for one in BUILT_IN.values()] == list(BUILT_IN)
+    poses = [{"rate_hz": 50, "x_m": 1e-3, "y_m": 1e-3, "heading_rad": rad} for rad in (0.01, 0.02)]
+    labels = [Sensors.model_validate({"pose": one}).label for one in poses]
+    assert len(set(labels)) == 2
+    assert all(one.startswith("pose 50 Hz (") and len(one) < 25 for one in labels)
 
 
 def test_the_example_in_the_docs_is_read(tmp_path: Path) -> None:
