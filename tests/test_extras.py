@@ -51,7 +51,12 @@ def test_what_is_not_for_every_python_is_marked_so_in_every_list() -> None:
 def release(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("release")
     made = [f"{name}={folder / part}" for name, part in (("RELEASE", "files"), ("LISTED", "env"))]
-    subprocess.run(["make", "release", *made], cwd=ROOT, check=True)
+    done = subprocess.run(
+        ["make", "release", *made], cwd=ROOT, check=False, capture_output=True, text=True
+    )
+    if "Failed to fetch" in done.stderr:
+        pytest.skip("no package index can be reached, from which a release is installed")
+    assert done.returncode == 0, done.stderr
     return folder / "files"
 
 
