@@ -115,11 +115,11 @@ class Driver:
         self._decided, self._braking = ffi.new("br_decision *"), ffi.new("br_braking *")
         self._around, self._null = ffi.new("br_environment *"), ffi.NULL
         self._believed, self._instruments = ffi.new("br_belief *"), dict[str, int]()
-        self._estimator, nominal = car.tuning.estimator, controller.nominal
+        self._tuning, nominal = car.tuning, controller.nominal
         if nominal is not None:  # it knows no car yet
             nominal.set_values(MpcSettings().parameters(car, nominal.manifest.problem.name))
         self._by_weights = bool(controller.weights_version)
-        self.estimate(self._estimator.settings(nominal=not self._by_weights))
+        self.estimate(self._tuning.estimation(nominal=not self._by_weights))
         self._refused: State | None = None
         self.last_error = ""
         """Of the last step that was broken; empty if none was."""
@@ -240,7 +240,7 @@ class Driver:
         """As much as a model with weights, or one without: from one run to the next."""
         if (by_weights := bool(self.controller.weights_version)) != self._by_weights:
             self._by_weights = by_weights
-            self.estimate(self._estimator.settings(nominal=not by_weights))
+            self.estimate(self._tuning.estimation(nominal=not by_weights))
 
     def _measurement(self, reading: Reading, known: dict[str, int]) -> Measurement | None:
         """``known``: numbers by name, to which it is added. None: of one instrument too many."""

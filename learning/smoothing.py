@@ -221,7 +221,7 @@ def smooth(
 
 def _start(first: Event, drive: Drive, car: CarParameters, around: Floats) -> tuple[Floats, Floats]:
     """Mean and covariance after the first pose."""
-    x, settings = around.copy(), car.tuning.estimator.settings(nominal=True)
+    x, settings = around.copy(), car.tuning.estimation(nominal=True)
     p = np.diag(np.square(settings["start"]))
     p[3:6] *= _VAGUE**2
     x[6] = drive.steering_rad
@@ -259,13 +259,13 @@ def _corrected(
     ends = [i if i == 0 or one.period >= 0 else 0 for i, one in enumerate(events[:-1])]
     begin = path[np.maximum.accumulate(ends), :_NX]
     step = corrected_steps(before[:, :_NX], begin, u.T, h[0], car, discretisation, weights)
-    z, period = np.unique(np.column_stack([begin[:, 3:], u.T]), axis=0, return_inverse=True)
+    z, period = _periods(begin, u.T)
     sigma = predictive_sigma(weights, z)[period]
     spread = step.by_error * sigma[:, None] * np.sqrt(h.T / discretisation.step_s)[:, None]
     f, q = np.tile(np.eye(_NB), (e, 1, 1)), np.zeros((e, _NB, _NB))
     f[:, :_NX, :_NX] = step.slope
     q[:, :_NX, :_NX] = spread @ spread.transpose(0, 2, 1)
-    drift = np.square(car.tuning.estimator.settings(nominal=False)["drift"])
+    drift = np.square(car.tuning.estimation(nominal=False)["drift"])
     q += np.diag(drift) * h.T[..., None]
     after = before.copy()
     after[:, :_NX] = step.ahead
@@ -274,6 +274,12 @@ def _corrected(
         return after[i - 1] + (x - before[i - 1]) @ f[i - 1].T, f[i - 1], q[i - 1]
 
     return go
+
+
+def _periods(begin: Floats, u: Floats) -> tuple[Floats, Rows]:
+    """Features (m, 6) of each period, and the number of the one that each row is of."""
+    z, row = np.unique(np.column_stack([begin[:, 3:], u]), axis=0, return_inverse=True)
+    return z, row
 
 
 class Steps(NamedTuple):
@@ -304,7 +310,7 @@ def corrected_steps(
     count, share = len(x), h / discretisation.step_s
     mean, gradient = np.zeros((count, 3)), np.zeros((count, 3, 6))
     if weights is not None:  # the same in all parts of a period
-        z, period = np.unique(np.column_stack([begin[:, 3:], u]), axis=0, return_inverse=True)
+        z, period = _periods(begin, u)
         features = ca.SX.sym("z", 6)
         found = mean_function(weights)(features)
         at = ca.Function("gp", [features], [found, ca.densify(ca.jacobian(found, features))])

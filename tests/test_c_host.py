@@ -62,7 +62,7 @@ def data(
     """Racing line, weights and settings."""
     folder = tmp_path_factory.mktemp("data")
     values = SETTINGS.parameters(car) | ControllerSettings().cycle_values(car)
-    values |= car.tuning.estimator.settings(nominal=False)
+    values |= car.tuning.estimation(nominal=False)
     table = circuit.table
     export(folder, read_manifest(kinematic_artefact), table.rows, table.spacing_m, values, weights)
     return folder

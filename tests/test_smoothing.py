@@ -81,8 +81,8 @@ def dense(
     """Means (e, 9) and covariance (9 e, 9 e) at all events, of all readings at once: the joint
     Gaussian of the chain that the C code linearises, conditioned by its textbook formula."""
     events, path = one.events, found.path
-    tuning = car.tuning.estimator
-    begin, drift = (tuning.settings(nominal=False)[name] for name in ("start", "drift"))
+    tuning = car.tuning
+    begin, drift = (tuning.estimation(nominal=False)[name] for name in ("start", "drift"))
     p = np.diag(np.square(begin))
     p[3:6] *= 100
     p[:3, :3], p[6, 6], p[8, 8] = np.diag(np.square(POSE)), 0, 0

@@ -176,29 +176,9 @@ class EstimatorTuning(_Section):
     acceleration_radps2: float = _number(120.0, "and of the yaw rate [rad/s^2]", ge=0)
     acceleration_s: float = _number(0.2, "time in which they are forgotten [s]")
     yaw_lag_s: float = _number(0.08, "with which the yaw rate follows the steering angle then [s]")
-    understeer_s2pm: float = _number(0.008, "angle per lateral acceleration then [rad s^2/m]", ge=0)
     gate: float = _number(
         1.0, "times the squared distance that one of 1,000 exceeds, a reading is refused [-]", ge=0
     )
-
-    def settings(self, *, nominal: bool) -> dict[str, Any]:
-        """Those of br_estimation, by name; ``nominal``: of a model without weights."""
-        along, about = self.acceleration_mps2, self.acceleration_radps2
-        return {
-            "start": (
-                self.position_m, self.position_m, self.heading_rad, self.speed_mps,
-                self.lateral_mps, self.yaw_rate_radps, self.steering_rad, self.gyro_offset_radps,
-                self.steering_offset_rad,
-            ),
-            "drift": (
-                0.0, 0.0, 0.0, self.drift_mps, self.drift_mps, self.drift_radps, 0.0, 0.0, 0.0,
-            ),
-            "acceleration": (along, along, about) if nominal else (0.0, 0.0, 0.0),
-            "acceleration_s": self.acceleration_s,
-            "yaw_lag_s": self.yaw_lag_s,
-            "understeer": self.understeer_s2pm,
-            "gate": self.gate,
-        }  # fmt: skip
 
 
 class PlausibleTuning(_Section):
@@ -354,6 +334,27 @@ class Tuning(_Section):
     pursuit: PursuitTuning
     gate: GateTuning
     driving: DrivingTuning
+
+    def estimation(self, *, nominal: bool) -> dict[str, Any]:
+        """The members of br_estimation by name; ``nominal``: for a model without weights, where the
+        car understeers as for pure pursuit."""
+        one = self.estimator
+        along, about = one.acceleration_mps2, one.acceleration_radps2
+        return {
+            "start": (
+                one.position_m, one.position_m, one.heading_rad, one.speed_mps,
+                one.lateral_mps, one.yaw_rate_radps, one.steering_rad, one.gyro_offset_radps,
+                one.steering_offset_rad,
+            ),
+            "drift": (
+                0.0, 0.0, 0.0, one.drift_mps, one.drift_mps, one.drift_radps, 0.0, 0.0, 0.0,
+            ),
+            "acceleration": (along, along, about) if nominal else (0.0, 0.0, 0.0),
+            "acceleration_s": one.acceleration_s,
+            "yaw_lag_s": one.yaw_lag_s,
+            "understeer": self.pursuit.understeer_s2pm,
+            "gate": one.gate,
+        }  # fmt: skip
 
     @classmethod
     def completed(cls, given: dict[str, Any], scales: Scales) -> dict[str, Any]:

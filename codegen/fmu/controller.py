@@ -121,7 +121,7 @@ def _sources(artefact: Path, car: CarParameters, *, nominal: bool) -> dict[str, 
     files = {path.name: path for path in (NATIVE / "controller.c", *own, *artefact.glob("*.a"))}
     files |= {f"daqp/{path.name}": path for path in (artefact / "daqp").iterdir()}
     planned = " ".join(f"X({name})" for name, *_ in _PLANNED)
-    tables = reading_tables(car.sensors, car.tuning.estimator.settings(nominal=nominal))
+    tables = reading_tables(car.sensors, car.tuning.estimation(nominal=nominal))
     made = {"controller_tables.h": f"#define PLANNED(X) {planned}\n{tables}".encode()}
     return made | {name: path.read_bytes() for name, path in sorted(files.items())}
 

@@ -68,7 +68,7 @@ def export(
     manifest = read_manifest(folder)
     manifest.check_car(parameters, folder)
     values = given["settings"] | ControllerSettings().cycle_values(parameters)
-    values |= parameters.tuning.estimator.settings(nominal=False)
+    values |= parameters.tuning.estimation(nominal=False)
     write(out, manifest, given["rows"], given["spacing_m"], values, given["weights"])
     typer.echo(f"{track or parameters.race_track}, {parameters.name}: {out}")
 
