@@ -410,12 +410,14 @@ class NativeProblem:
         self._library.br_mpc_get_reference(self.handle, stages)
         return rows
 
-    def variance(self, v: Floats) -> Floats:
-        """Posterior variance of the residual's outputs at v = [x; u] (nv,), noise included."""
-        variance, result = self._made(self.manifest.problem.outputs)
+    def variance(self, v: Floats) -> tuple[Floats, Floats]:
+        """Posterior variance of the residual's outputs at v = [x; u] (nv,), noise included; and
+        that of the noise."""
+        made = self._made(outputs := self.manifest.problem.outputs), self._made(outputs)
         given = self._given("v", v, self._nx + self._nu)
-        self._check(self._library.br_mpc_variance(self.handle, given, result), "variance")
-        return variance
+        results = (result for _, result in made)
+        self._check(self._library.br_mpc_variance(self.handle, given, *results), "variance")
+        return made[0][0], made[1][0]
 
     def evaluate(self, v: Floats, costate: Floats) -> tuple[Floats, Floats, Floats]:
         """Corrected model at v = [x; u] (nv,): x_next (nx,), J (nx, nv), H of lambda' x_next."""

@@ -33,21 +33,23 @@ class Estimator:
         self._belief = self._ffi.new("br_belief *")
 
     def advance(
-        self, time_s: float, u: Floats, variance: Floats, measured: Sequence[Measurement]
+        self,
+        time_s: float,
+        u: Floats,
+        residual: tuple[Floats, Floats],
+        measured: Sequence[Measurement],
     ) -> bool:
         """The period that ends at ``time_s`` is over; whether anything is known yet.
 
-        ``u`` (nu,) acted in it; ``variance`` (ne,): of the residual, per stage. InputError for a
-        time before the last one.
+        ``u`` (nu,) acted in it; ``residual``: its variance (ne,), per stage, and that of its noise.
+        InputError for a time before the last one.
         """
         given = self._ffi.new("br_measurement[]", len(measured))
         fill(given, measured)
-        numbers = (
-            self._ffi.from_buffer("double[]", np.ascontiguousarray(one, dtype=np.float64))
-            for one in (u, variance)
-        )
+        acted = self._ffi.from_buffer("double[]", np.ascontiguousarray(u, dtype=np.float64))
+        known = self._ffi.new("br_residual *", [one.tolist() for one in residual])
         error = self._library.br_estimator_advance(
-            self.handle, time_s, *numbers, given, len(measured)
+            self.handle, time_s, acted, known, given, len(measured)
         )
         if error == self._library.BR_ERROR_NOT_READY:
             return False

@@ -69,7 +69,7 @@ def test_the_compiled_variance_is_the_posterior_s(
     step = make(some)
     states, inputs = smooth_drive(car, 30, seed=5)
     states[0, 3:] *= 5  # far from all data
-    ours = np.array([step.variance(v) for v in np.column_stack([states, inputs])])
+    ours = np.array([step.variance(v)[0] for v in np.column_stack([states, inputs])])
     theirs = predictive_sigma(some, np.column_stack([states[:, 3:], inputs])) ** 2
     prior = np.array([sum(output.amplitudes[2:]) for output in some.outputs])
     np.testing.assert_allclose(ours / prior, theirs / prior, rtol=0, atol=1e-9)
@@ -80,7 +80,7 @@ def test_of_more_points_than_there_is_room_for_some_count(make: Make, car: CarPa
     weights = fit_weights(car, ("rbf", "matern25", "matern15"), count=1024)
     step = make(weights)
     states, inputs = smooth_drive(car, 30, seed=5)
-    ours = np.array([step.variance(v) for v in np.column_stack([states, inputs])])
+    ours = np.array([step.variance(v)[0] for v in np.column_stack([states, inputs])])
     exact = predictive_sigma(weights, np.column_stack([states[:, 3:], inputs])) ** 2
     prior = np.array([sum(output.amplitudes[2:]) for output in weights.outputs])
     assert (ours >= exact * (1 - 1e-6)).all()

@@ -159,7 +159,7 @@ class EstimatorTuning(_Section):
 
     Standard deviations before anything has been measured, around 0, and random walks beyond what
     the model with its weights says of its own uncertainty. Without weights, as in training drives,
-    accelerations are estimated, too.
+    accelerations are estimated in place of the model.
     """
 
     position_m: float = _number(1.0, "of a coordinate [m]")
@@ -170,11 +170,12 @@ class EstimatorTuning(_Section):
     steering_rad: float = _number(0.05, "of the steering angle [rad]")
     gyro_offset_radps: float = _number(0.1, "of the gyro's offset [rad/s]", ge=0)
     steering_offset_rad: float = _number(0.02, "of the measured steering angle's [rad]", ge=0)
-    drift_mps: float = _number(0.005, "walk of the velocities in a second [m/s]")
-    drift_radps: float = _number(0.05, "and of the yaw rate [rad/s]")
+    drift_mps: float = _number(0.0025, "walk of the velocities in a second [m/s]")
+    drift_radps: float = _number(0.025, "and of the yaw rate [rad/s]")
     acceleration_mps2: float = _number(6.0, "of accelerations without weights [m/s^2]", ge=0)
     acceleration_radps2: float = _number(120.0, "and of the yaw rate [rad/s^2]", ge=0)
     acceleration_s: float = _number(0.2, "time in which they are forgotten [s]")
+    error_s: float = _number(0.05, "and what weights err by where they have not been trained [s]")
     yaw_lag_s: float = _number(0.08, "with which the yaw rate follows the steering angle then [s]")
     gate: float = _number(
         1.0, "times the squared distance that one of 1,000 exceeds, a reading is refused [-]", ge=0
@@ -350,7 +351,7 @@ class Tuning(_Section):
                 0.0, 0.0, 0.0, one.drift_mps, one.drift_mps, one.drift_radps, 0.0, 0.0, 0.0,
             ),
             "acceleration": (along, along, about) if nominal else (0.0, 0.0, 0.0),
-            "acceleration_s": one.acceleration_s,
+            "acceleration_s": one.acceleration_s if nominal else one.error_s,
             "yaw_lag_s": one.yaw_lag_s,
             "understeer": self.pursuit.understeer_s2pm,
             "gate": one.gate,

@@ -3,13 +3,13 @@
  * An extended Kalman filter over the controller's own corrected model (br_mpc_propagate), with the
  * weights in use. Instruments measure some of the states at a time, whenever they do, and may say
  * so late: what came after is then done over. Two offsets are estimated beside the states: of the
- * measured yaw rate (a gyro's) and of the measured steering angle. Where no weights correct the
- * model, accelerations may be estimated as well, as first-order Markov processes (Singer,
- * "Estimating optimal tracking filter performance for manned maneuvering targets", IEEE Trans. AES
- * 6, 1970): beside the model's along the car, in place of its lateral motion, and beside a lag of
- * the yaw rate in place of its yaw.
+ * measured yaw rate (a gyro's) and of the measured steering angle; and accelerations that the model
+ * lacks, as first-order Markov processes (Singer, "Estimating optimal tracking filter performance
+ * for manned maneuvering targets", IEEE Trans. AES 6, 1970): where its weights guess, as large as
+ * their variance, and where there are none, beside the model's acceleration along the car, in place
+ * of its lateral motion, and beside a lag of the yaw rate in place of its yaw.
  *
- *   br_estimator_advance(estimator, time_s, u, variance, measurements, count);   each period
+ *   br_estimator_advance(estimator, time_s, u, residual, measurements, count);   each period
  *   br_estimator_read(estimator, &belief);
  *
  * As with br_mpc, an estimator lives in memory of the caller's, allocates nothing, and is for one
@@ -61,14 +61,20 @@ typedef struct {
     double start[BR_NB]; /* standard deviations of what has not been measured yet, around 0; an
                           * offset with 0 is none */
     double drift[BR_NB]; /* random walk beyond the model's own uncertainty [unit/sqrt(s)] */
-    double acceleration[BR_NE]; /* standard deviations of these accelerations, around 0; all 0: the
-                                 * model alone moves the car */
-    double acceleration_s;      /* their time constant; above 0, unless there are none */
+    double acceleration[BR_NE]; /* standard deviations of accelerations in place of the model,
+                                 * around 0; all 0: the model moves the car, and what it lacks */
+    double acceleration_s;      /* the time constant of either, above 0 */
     double yaw_lag_s;  /* with which the yaw rate then follows the steering angle, above 0; ... */
     double understeer; /* ... what of the angle a lateral acceleration takes up [rad s^2/m] */
     double gate; /* a measurement is refused beyond so many times the squared distance that one of
                   * 1,000 exceeds (chi-squared); 0: none is */
 } br_estimation;
+
+/* How uncertain the residual is, variances per stage: noise is that part of it which was not
+ * explained in training. */
+typedef struct {
+    double variance[BR_NE], noise[BR_NE];
+} br_residual;
 
 /* State with its covariance. */
 typedef struct {
@@ -114,15 +120,15 @@ BR_API br_mpc_error br_estimator_set(br_estimator *estimator, const br_estimatio
 BR_API void br_estimator_reset(br_estimator *estimator);
 
 /* The period that ends at time_s is over: u acted in it, and so much has been measured, in it or
- * before. variance: of the residual, per stage; NULL: 0. It begins with a position and heading that
- * are measured together, and anew after a second without unless they are contradicted. Where what
- * follows does not fit to a car around standstill, it begins with the difference of two poses. What
- * contradicts, repeats itself or is of another time five times in a row, or does not come for five
- * intervals and 0.15 s, is left out until three in a row agree (br_instrument.c).
- * BR_ERROR_NOT_READY while it has not begun; BR_ERROR_TIME if time_s is not after the period
- * before, BR_ERROR_STATE if the model cannot follow: it then begins anew. */
+ * before. residual: NULL: 0. It begins with a position and heading that are measured together, and
+ * anew after a second without unless they are contradicted. Where what follows does not fit to a
+ * car around standstill, it begins with the difference of two poses. What contradicts, repeats
+ * itself or is of another time five times in a row, or does not come for five intervals and 0.15 s,
+ * is left out until three in a row agree (br_instrument.c). BR_ERROR_NOT_READY while it has not
+ * begun; BR_ERROR_TIME if time_s is not after the period before, BR_ERROR_STATE if the model cannot
+ * follow: it then begins anew. */
 BR_API br_mpc_error br_estimator_advance(br_estimator *estimator, double time_s,
-                                         const double u[BR_NU], const double variance[BR_NE],
+                                         const double u[BR_NU], const br_residual *residual,
                                          const br_measurement *measurements, int count);
 
 /* At the end of the last period. */

@@ -211,8 +211,9 @@ br_mpc_error br_mpc_steer(const br_mpc *mpc, const double x[BR_NX], double *s_m,
 }
 #endif
 
-br_mpc_error br_mpc_variance(br_mpc *mpc, const double v[BR_NV], double variance[BR_NE]) {
-    return mpc ? mpc->code->variance(mpc, v, variance) : BR_ERROR_NULL;
+br_mpc_error br_mpc_variance(br_mpc *mpc, const double v[BR_NV], double variance[BR_NE],
+                             double noise[BR_NE]) {
+    return mpc ? mpc->code->variance(mpc, v, variance, noise) : BR_ERROR_NULL;
 }
 
 br_mpc_error br_mpc_evaluate(const br_mpc *mpc, const double v[BR_NV], const double lambda[BR_NX],

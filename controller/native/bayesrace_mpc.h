@@ -363,9 +363,11 @@ BR_API br_mpc_error br_mpc_get_tube(const br_mpc *mpc, double tube[BR_N]);
 BR_API br_mpc_error br_mpc_set_instructions(br_mpc *mpc, br_instructions instructions);
 BR_API br_instructions br_mpc_get_instructions(const br_mpc *mpc);
 
-/* Posterior variance of the residual at v = [x; u], noise included; 0 where it is not known. By the
+/* Posterior variance of the residual at v = [x; u], noise included; 0 where it is not known; and,
+ * where noise is not NULL, that of the noise alone. By the
  * proven weights, if they correct anything. */
-BR_API br_mpc_error br_mpc_variance(br_mpc *mpc, const double v[BR_NV], double variance[BR_NE]);
+BR_API br_mpc_error br_mpc_variance(br_mpc *mpc, const double v[BR_NV], double variance[BR_NE],
+                                    double noise[BR_NE]);
 
 /* Corrected model at v = [x; u]: x_next, J = d x_next / d v (row major) and
  * H = sum_i lambda_i d^2 x_next_i / d v^2. */

@@ -23,8 +23,8 @@ struct br_cycle {
     br_stream stream;
     br_monitor monitor;
     br_estimator estimator;
-    double variance[BR_NE];    /* of the residual in the newest state, if that is known: */
-    int has_variance, unknown; /* unknown: nothing has been estimated yet */
+    br_residual residual;      /* in the newest state, if that is known: */
+    int has_residual, unknown; /* unknown: nothing has been estimated yet */
     br_shown shown;
     br_delay delay;
     br_fallback fallback;
@@ -213,39 +213,58 @@ static void report(br_cycle *cycle) {
 
 /* The residual's variance where the car is, for the next estimate. */
 static void foresee(br_cycle *cycle) {
-    if (cycle->has_variance || cycle->unknown || !cycle->mpc) return;
+    if (cycle->has_residual || cycle->unknown || !cycle->mpc || !cycle->estimator.count) return;
     double v[BR_NV];
-    memcpy(v, cycle->stream.newest.x, BR_NX * sizeof(double));
+    br_residual *residual = &cycle->residual;
+    memcpy(v, br_estimator_now(&cycle->estimator)->x, BR_NX * sizeof(double));
     memcpy(v + BR_NX, cycle->decision.u, BR_NU * sizeof(double));
-    cycle->has_variance = br_mpc_variance(cycle->mpc, v, cycle->variance) == BR_OK;
+    cycle->has_residual =
+        br_mpc_variance(cycle->mpc, v, residual->variance, residual->noise) == BR_OK;
+}
+
+/* Over the periods whose states were lost, by the inputs that had been sent. */
+static void catch_up(br_cycle *cycle) {
+    br_estimator *estimator = &cycle->estimator;
+    const double interval_s = cycle->counters.interval_s;
+    if (cycle->unknown || !estimator->count || !(interval_s > 0)) return;
+    const double last_s = br_estimator_event(estimator, estimator->count - 1)->time_s;
+    const double lost_s = cycle->stream.newest.time_s - interval_s - last_s;
+    const double *u = br_delay_acting(&cycle->delay, last_s + lost_s / 2, cycle->counters.delay_s);
+    if (u && lost_s > interval_s / 2)
+        br_estimator_advance(estimator, last_s + lost_s, u,
+                             cycle->has_residual ? &cycle->residual : NULL, NULL, 0);
 }
 
 /* Of the step from the estimate before to this one. The car's own step differs from the model's by
- * q, of which the correction shows the share corrected / predicted: with e the error of an
- * estimate,
+ * something of variance q, of whose covariance c with the prediction's error the correction shows
+ * the share corrected / predicted: with e the error of an estimate,
  *
- *   var(e - f e_before) = corrected + q - 2 q corrected / predicted,
+ *   var(e - f e_before) = corrected + q - 2 c corrected / predicted,
  *
  * each state taken by itself. Where measurements say little that is more than is corrected: what
- * they have not shown of the car's step is no error of whatever weights. Without weights q is what
- * is not known of the acceleration. */
+ * they have not shown of the car's step is no error of whatever weights. c is q for what is
+ * independent from one step to the next, and more for accelerations that last. */
 static br_mpc_noise noise_of(const br_cycle *cycle, const br_estimate *now, double duration_s) {
     const br_estimator *estimator = &cycle->estimator;
     br_mpc_noise noise;
-    double added[BR_NX];
+    double q[BR_NX], c[BR_NX];
     for (int i = 0; i < BR_NX; ++i)
-        added[i] = duration_s * estimator->settings.drift[i] * estimator->settings.drift[i];
+        c[i] = q[i] = duration_s * estimator->settings.drift[i] * estimator->settings.drift[i];
     for (int j = 0; j < BR_NE; ++j) {
-        if (estimator->walks)
-            added[BR_RATE[j]] += duration_s * duration_s * now->p[BR_NB + j][BR_NB + j];
-        else if (cycle->has_variance)
-            added[BR_RATE[j]] += duration_s / BR_TS * cycle->variance[j];
+        const int i = BR_RATE[j], acceleration = BR_NB + j;
+        const double left = now->p[i][i] / (now->p[i][i] + estimator->corrected[i]);
+        const br_residual *residual = &cycle->residual;
+        if (!estimator->walks && cycle->has_residual)
+            c[i] = q[i] +=
+                duration_s / BR_TS * (residual->variance[j] - br_estimate_guessed(residual, j));
+        q[i] += duration_s * duration_s * now->p[acceleration][acceleration];
+        c[i] += duration_s * now->p[acceleration][i] / left; /* as it was predicted */
     }
     for (int i = 0; i < BR_NX; ++i) {
         const double corrected = estimator->corrected[i], predicted = now->p[i][i] + corrected;
         const double shown = predicted > 0 ? corrected / predicted : 0;
         noise.corrected[i] = corrected;
-        noise.step[i] = fmax(corrected + added[i] * (1 - 2 * shown), 0);
+        noise.step[i] = fmax(corrected + q[i] - 2 * c[i] * shown, 0);
     }
     return noise;
 }
@@ -258,10 +277,11 @@ static int estimate(br_cycle *cycle, const br_measured *before, br_mpc_noise *no
     const int most = given < BR_MEASUREMENTS ? given : BR_MEASUREMENTS;
     memcpy(newest->x, cycle->unknown ? none : before->x, sizeof newest->x);
     foresee(cycle);
+    catch_up(cycle);
     br_estimator *estimator = &cycle->estimator;
     const br_mpc_error error =
         br_estimator_advance(estimator, newest->time_s, newest->u_applied,
-                             cycle->has_variance ? cycle->variance : NULL, newest->measured, most);
+                             cycle->has_residual ? &cycle->residual : NULL, newest->measured, most);
     cycle->unknown = error != BR_OK || estimator->astray;
     cycle->doubt = BR_FAULT_NONE;
     if (!error) {
@@ -272,7 +292,7 @@ static int estimate(br_cycle *cycle, const br_measured *before, br_mpc_noise *no
         if (!cycle->doubt || begins) cycle->monitor.trusted_s = newest->time_s;
         cycle->monitor.measured_s = newest->time_s;
     }
-    cycle->has_variance = 0;
+    cycle->has_residual = 0;
     report(cycle);
     return !error;
 }
@@ -299,7 +319,7 @@ br_reception br_cycle_observe(br_cycle *cycle, const br_measured *state) {
         cycle->shown.duration_s = 0;
         br_monitor_restart(&cycle->monitor);
         br_estimator_reset(&cycle->estimator);
-        cycle->has_variance = 0;
+        cycle->has_residual = 0;
         cycle->unknown = state->estimated;
     }
     const br_fault doubted = cycle->doubt;

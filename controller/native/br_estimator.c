@@ -49,9 +49,9 @@ br_mpc_error br_estimator_set(br_estimator *estimator, const br_estimation *sett
         valid &= isfinite(settings->acceleration[j]) && settings->acceleration[j] >= 0;
         walks |= settings->acceleration[j] > 0;
     }
+    valid &= isfinite(settings->acceleration_s) && settings->acceleration_s > 0;
     if (walks)
-        valid &= isfinite(settings->acceleration_s) && settings->acceleration_s > 0 &&
-                 isfinite(settings->yaw_lag_s) && settings->yaw_lag_s > 0 &&
+        valid &= isfinite(settings->yaw_lag_s) && settings->yaw_lag_s > 0 &&
                  isfinite(settings->understeer) && settings->understeer >= 0;
     if (!valid) return BR_ERROR_PARAMETERS;
     estimator->settings = *settings;
@@ -109,13 +109,13 @@ static void solve(int n, double s[BR_NX][BR_NX], double v[BR_NX]) {
 static void update(const br_measurement *m, double hp[BR_NX][BR_NA], double k[BR_NA][BR_NX],
                    br_estimate *b) {
     double left[BR_NA][BR_NA];
-    for (int i = 0; i < b->count; ++i)
-        for (int j = 0; j < b->count; ++j) {
+    for (int i = 0; i < BR_NA; ++i)
+        for (int j = 0; j < BR_NA; ++j) {
             left[i][j] = b->p[i][j];
             for (int a = 0; a < m->count; ++a) left[i][j] -= k[i][a] * hp[a][j];
         }
-    for (int i = 0; i < b->count; ++i)
-        for (int j = i; j < b->count; ++j) {
+    for (int i = 0; i < BR_NA; ++i)
+        for (int j = i; j < BR_NA; ++j) {
             double sum = left[i][j];
             for (int a = 0; a < m->count; ++a)
                 sum += k[j][a] * (m->deviation[a] * m->deviation[a] * k[i][a] -
@@ -134,7 +134,7 @@ static double take(double gate, const br_measurement *m, br_estimate *b) {
         difference[a] = m->value[a] - br_estimate_observed(b->x, m->of[a]);
         if (m->of[a] == BR_INDEX_PSI) difference[a] = remainder(difference[a], 2 * M_PI);
         weighted[a] = difference[a];
-        for (int i = 0; i < b->count; ++i) hp[a][i] = br_estimate_observed(b->p[i], m->of[a]);
+        for (int i = 0; i < BR_NA; ++i) hp[a][i] = br_estimate_observed(b->p[i], m->of[a]);
     }
     for (int a = 0; a < n; ++a) {
         for (int c = 0; c < n; ++c) s[a][c] = br_estimate_observed(hp[a], m->of[c]);
@@ -144,7 +144,7 @@ static double take(double gate, const br_measurement *m, br_estimate *b) {
     solve(n, s, weighted);
     for (int a = 0; a < n; ++a) squared += difference[a] * weighted[a];
     if (!(squared >= 0) || (gate > 0 && squared > gate * EXCEEDED[n - 1])) return -1;
-    for (int i = 0; i < b->count; ++i) {
+    for (int i = 0; i < BR_NA; ++i) {
         for (int a = 0; a < n; ++a) {
             b->x[i] += hp[a][i] * weighted[a];
             k[i][a] = hp[a][i];
@@ -259,8 +259,7 @@ static void begin(br_estimator *estimator, const br_measurement *m, const br_mea
     br_estimator_reset(estimator); /* never of one that is latched */
     estimator->agreed = estimator->astray = 0;
     estimator->posed_s = m->time_s;
-    b->count = estimator->walks ? BR_NA : BR_NB;
-    for (int i = 0; i < b->count; ++i) {
+    for (int i = 0; i < BR_NA; ++i) {
         const br_estimation *s = &estimator->settings;
         const double deviation = i < BR_NB ? s->start[i] : s->acceleration[i - BR_NB];
         b->p[i][i] = deviation * deviation;
@@ -350,18 +349,19 @@ static double widen(const br_estimator *estimator, const br_event *one) {
     const br_instrument *instrument = &estimator->instrument[m->instrument];
     int contradicted;
     if (!(gate > 0) || !estimator->agreed) return 1;
-    if (!instrument->refused_in_row || instrument->fault) return 1;
+    if (!instrument->refused_in_row || br_instrument_contradicts(instrument->fault)) return 1;
     if (!br_instrument_near(instrument, m, &one->after)) return 1;
-    if (br_estimator_blind(estimator, &contradicted)) return 1;
+    if (br_estimator_blind(estimator, &contradicted) && contradicted) return 1;
     br_estimate alone = one->after;
     return fmin(fmax(take(INFINITY, m, &alone) / m->count, 1), WIDEST);
 }
 
 /* The covariance, but for the offsets: these belong to the sensors. */
 static void grow(double by, br_estimate *b) {
-    for (int i = 0; i < b->count; ++i)
-        for (int j = 0; j < b->count; ++j)
-            b->p[i][j] *= (i < BR_NX ? sqrt(by) : 1) * (j < BR_NX ? sqrt(by) : 1);
+    double factor[BR_NA];
+    for (int i = 0; i < BR_NA; ++i) factor[i] = i < BR_NX || i >= BR_NB ? sqrt(by) : 1;
+    for (int i = 0; i < BR_NA; ++i)
+        for (int j = 0; j < BR_NA; ++j) b->p[i][j] *= factor[i] * factor[j];
 }
 
 /* The measurement in what is believed at its time. */
@@ -397,7 +397,7 @@ static br_mpc_error redo(br_estimator *estimator, int k, int end) {
         br_event *one = br_estimator_event(estimator, k);
         const br_event *before = br_estimator_event(estimator, k - 1);
         one->after = before->after;
-        const br_mpc_error error = br_estimator_reach(estimator, one->u, one->variance,
+        const br_mpc_error error = br_estimator_reach(estimator, one->u, &one->residual,
                                                       one->time_s - before->time_s, &one->after);
         if (error) return error;
         if (one->measured.count)
@@ -440,7 +440,7 @@ static br_mpc_error period(br_estimator *estimator, const br_event *given,
     br_event end = *given;
     end.after = newest->after;
     br_estimate predicted = newest->after;
-    br_mpc_error error = br_estimator_reach(estimator, end.u, end.variance, duration, &predicted);
+    br_mpc_error error = br_estimator_reach(estimator, end.u, &end.residual, duration, &predicted);
     insert(estimator, estimator->count, &end);
     if (!error) error = take_all(estimator, end.time_s, measurements, count, begun_with);
     newest = br_estimator_event(estimator, estimator->count - 1);
@@ -459,7 +459,7 @@ static int outdated(br_estimator *estimator, double time_s, int pose) {
 }
 
 br_mpc_error br_estimator_advance(br_estimator *estimator, double time_s, const double u[BR_NU],
-                                  const double variance[BR_NE], const br_measurement *measurements,
+                                  const br_residual *residual, const br_measurement *measurements,
                                   int count) {
     if (!estimator || !u || (count > 0 && !measurements)) return BR_ERROR_NULL;
     if (!estimator->has_settings) return BR_ERROR_NOT_READY;
@@ -479,7 +479,7 @@ br_mpc_error br_estimator_advance(br_estimator *estimator, double time_s, const 
     if (anew) begin(estimator, pose, NULL);
     br_event end = {.time_s = time_s};
     memcpy(end.u, u, sizeof end.u);
-    if (variance) memcpy(end.variance, variance, sizeof end.variance);
+    if (residual) end.residual = *residual;
     br_mpc_error error = period(estimator, &end, measurements, count, anew ? pose : NULL);
     const br_measurement before = estimator->pose;
     const double apart_s = pose && !anew ? pose->time_s - before.time_s : 0;

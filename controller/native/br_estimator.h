@@ -14,15 +14,15 @@ _Static_assert(sizeof BR_RATE / sizeof BR_RATE[0] == BR_NE, "a state for each re
 #endif
 
 typedef struct {
-    int count; /* of these: BR_NA, or BR_NB without accelerations */
     double x[BR_NA], p[BR_NA][BR_NA];
     double way[BR_NX]; /* how far x has moved since the beginning of its period */
 } br_estimate;
 
 typedef struct {
-    double time_s, u[BR_NU], variance[BR_NE]; /* u acted since the event before */
-    br_measurement measured;                  /* count 0: the end of a period */
-    int judged;                               /* it is in the counts of its instrument */
+    double time_s, u[BR_NU]; /* u acted since the event before */
+    br_residual residual;
+    br_measurement measured; /* count 0: the end of a period */
+    int judged;              /* it is in the counts of its instrument */
     int left_out;
     double widening; /* of the covariance before it is compared */
     br_estimate after;
@@ -55,10 +55,17 @@ static inline const br_estimate *br_estimator_now(br_estimator *estimator) {
 /* What is expected of a measured state, its offset included. */
 double br_estimate_observed(const double x[BR_NA], int state);
 
+/* What of the residual's variance is no noise, but a guess: where a Gaussian process has not been
+ * trained, its error follows the car's state, and lasts for longer than a stage. */
+static inline double br_estimate_guessed(const br_residual *residual, int j) {
+    const double beyond = residual->variance[j] - 2 * residual->noise[j];
+    return beyond > 0 ? beyond : 0;
+}
+
 /* --- br_motion.c: x and P after a duration, under u --- */
 
 br_mpc_error br_estimator_reach(const br_estimator *estimator, const double u[BR_NU],
-                                const double variance[BR_NE], double duration, br_estimate *b);
+                                const br_residual *residual, double duration, br_estimate *b);
 
 /* --- br_instrument.c: whether what an instrument reports can be believed --- */
 
@@ -75,6 +82,9 @@ int br_instrument_repeats(br_instrument *instrument, const br_measurement *m, co
 int br_instrument_near(const br_instrument *instrument, const br_measurement *m,
                        const br_estimate *b);
 int br_instrument_possible(const br_measurement *m, const br_estimate *b);
+
+/* Whether such an instrument says something that cannot be, rather than nothing. */
+int br_instrument_contradicts(int fault);
 
 /* What in the measurement is farthest from what is expected. */
 br_fault br_instrument_kind(const br_measurement *m, const br_estimate *b);

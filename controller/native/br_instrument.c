@@ -127,13 +127,13 @@ br_fault br_instrument_kind(const br_measurement *m, const br_estimate *b) {
     return kind_of(which);
 }
 
-/* It says something that cannot be, rather than nothing. */
-static int contradicts(int fault) {
+int br_instrument_contradicts(int fault) {
     return fault != BR_FAULT_NONE && fault != BR_FAULT_FROZEN && fault != BR_FAULT_TIME;
 }
 
 void br_instrument_bad(br_instrument *instrument, br_fault kind) {
-    if (instrument->fault && contradicts(instrument->fault) != contradicts(kind) &&
+    if (instrument->fault &&
+        br_instrument_contradicts(instrument->fault) != br_instrument_contradicts(kind) &&
         instrument->bad_in_row >= AGAINST)
         instrument->bad_in_row = 0; /* another fault than that which is known */
     instrument->good_in_row = 0;
@@ -183,7 +183,7 @@ br_fault br_estimator_blind(const br_estimator *estimator, int *contradicted) {
             return BR_FAULT_NONE;
         }
         found = (br_fault)one->fault;
-        *contradicted |= contradicts(found);
+        *contradicted |= br_instrument_contradicts(found);
     }
     return found;
 }

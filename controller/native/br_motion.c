@@ -1,5 +1,5 @@
-/* How an estimate moves between two events: by the corrected model, or, where nothing corrects it,
- * by accelerations that are estimated as well (bayesrace_estimator.h).
+/* How an estimate moves between two events: by the corrected model and what that may err by, or,
+ * where nothing corrects it, by accelerations in its place (bayesrace_estimator.h).
  */
 #include "br_estimator.h"
 
@@ -8,29 +8,30 @@
 
 #if BR_HAS_PATH
 
+#define GUESSING 2.0 /* deviations of the residual by which a guess errs */
+
 /* P <- F P F' + Q, where what is beside the states stays. */
 static void spread(const double jacobian[BR_NX * BR_NX],
                    const double by_acceleration[BR_NX * BR_NE], const double q[BR_NX * BR_NX],
                    br_estimate *b) {
     double f[BR_NX][BR_NA] = {{0}}, fp[BR_NX][BR_NA];
-    const int n = b->count;
     for (int i = 0; i < BR_NX; ++i) {
         for (int l = 0; l < BR_NX; ++l) f[i][l] = jacobian[BR_NX * i + l];
-        for (int j = 0; j < n - BR_NB; ++j) f[i][BR_NB + j] = by_acceleration[BR_NE * i + j];
-        for (int j = 0; j < n; ++j) {
+        for (int j = 0; j < BR_NE; ++j) f[i][BR_NB + j] = by_acceleration[BR_NE * i + j];
+        for (int j = 0; j < BR_NA; ++j) {
             fp[i][j] = 0;
             for (int l = 0; l < BR_NX; ++l) fp[i][j] += f[i][l] * b->p[l][j];
-            for (int l = BR_NB; l < n; ++l) fp[i][j] += f[i][l] * b->p[l][j];
+            for (int l = BR_NB; l < BR_NA; ++l) fp[i][j] += f[i][l] * b->p[l][j];
         }
     }
     for (int i = 0; i < BR_NX; ++i) {
         for (int j = i; j < BR_NX; ++j) {
             double sum = q[BR_NX * i + j];
             for (int l = 0; l < BR_NX; ++l) sum += fp[i][l] * f[j][l];
-            for (int l = BR_NB; l < n; ++l) sum += fp[i][l] * f[j][l];
+            for (int l = BR_NB; l < BR_NA; ++l) sum += fp[i][l] * f[j][l];
             b->p[i][j] = b->p[j][i] = sum;
         }
-        for (int j = BR_NX; j < n; ++j) b->p[i][j] = b->p[j][i] = fp[i][j];
+        for (int j = BR_NX; j < BR_NA; ++j) b->p[i][j] = b->p[j][i] = fp[i][j];
     }
 }
 
@@ -77,27 +78,37 @@ static br_mpc_error walk(const br_estimator *estimator, const br_estimate *b, co
     return BR_OK;
 }
 
+/* The variance of an acceleration: in place of the model, or of what this errs by. */
+static double walking(const br_estimation *s, const br_residual *residual, int j) {
+    const double deviation = s->acceleration[j], erring = GUESSING / BR_TS;
+    return deviation * deviation + erring * erring * br_estimate_guessed(residual, j);
+}
+
 /* Accelerations after a duration: less of what they were, and something new. */
-static void fade(const br_estimation *settings, double duration, br_estimate *b) {
-    const double left = exp(-duration / settings->acceleration_s);
-    for (int i = BR_NB; i < BR_NA; ++i) {
-        const double deviation = settings->acceleration[i - BR_NB];
+static void fade(const br_estimation *s, const br_residual *residual, double duration,
+                 br_estimate *b) {
+    const double left = exp(-duration / s->acceleration_s);
+    for (int j = 0; j < BR_NE; ++j) {
+        const int i = BR_NB + j;
         b->x[i] *= left;
         for (int l = 0; l < BR_NA; ++l) b->p[i][l] = b->p[l][i] = left * b->p[i][l];
-        b->p[i][i] = left * b->p[i][i] + (1 - left * left) * deviation * deviation;
+        b->p[i][i] = left * b->p[i][i] + (1 - left * left) * walking(s, residual, j);
     }
 }
 
 /* x and P after a duration of at most a stage, under u. The residual is that of where the period
  * began, by what is believed now: taken anew at each measurement it would run ahead of the car. */
 static br_mpc_error propagate(const br_estimator *estimator, const double u[BR_NU],
-                              const double variance[BR_NE], double duration, br_estimate *b) {
+                              const br_residual *residual, double duration, br_estimate *b) {
     double f[BR_NX * BR_NX], by[BR_NX * BR_NE], q[BR_NX * BR_NX], begin[BR_NX], next[BR_NX];
+    double white[BR_NE];
     for (int i = 0; i < BR_NX; ++i) begin[i] = b->x[i] - b->way[i];
+    for (int j = 0; j < BR_NE; ++j)
+        white[j] = residual->variance[j] - br_estimate_guessed(residual, j);
     const br_mpc_error error = estimator->walks
                                    ? walk(estimator, b, u, duration, next, f, by, q)
                                    : br_mpc_propagate(estimator->mpc, b->x, begin, u, duration,
-                                                      variance, NULL, next, f, by, q);
+                                                      white, b->x + BR_NB, next, f, by, q);
     if (error) return error;
     for (int i = 0; i < BR_NX; ++i) {
         b->way[i] += next[i] - b->x[i];
@@ -107,19 +118,19 @@ static br_mpc_error propagate(const br_estimator *estimator, const double u[BR_N
     const br_estimation *s = &estimator->settings;
     for (int i = 0; i < BR_NB; ++i)
         if (i < BR_NX || s->start[i] > 0) b->p[i][i] += duration * s->drift[i] * s->drift[i];
-    if (estimator->walks) fade(s, duration, b);
+    fade(s, residual, duration, b);
     return BR_OK;
 }
 
 br_mpc_error br_estimator_reach(const br_estimator *estimator, const double u[BR_NU],
-                                const double variance[BR_NE], double duration, br_estimate *b) {
+                                const br_residual *residual, double duration, br_estimate *b) {
     br_mpc_error error = BR_OK;
     for (; duration > BR_TS + BR_SAME_S && !error; duration -= BR_TS) {
-        error = propagate(estimator, u, variance, BR_TS, b);
+        error = propagate(estimator, u, residual, BR_TS, b);
         memset(b->way, 0, sizeof b->way);
     }
     if (error || duration < BR_SAME_S) return error;
-    return propagate(estimator, u, variance, fmin(duration, BR_TS), b);
+    return propagate(estimator, u, residual, fmin(duration, BR_TS), b);
 }
 
 #endif

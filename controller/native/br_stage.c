@@ -259,13 +259,16 @@ br_mpc_error br_propagate(const br_mpc *mpc, const double x[BR_NX], const double
 
 /* --- the model and its uncertainty at one stage, for tests and tools --- */
 
-br_mpc_error br_variance(br_mpc *mpc, const double v[BR_NV], double variance[BR_NE]) {
+br_mpc_error br_variance(br_mpc *mpc, const double v[BR_NV], double variance[BR_NE],
+                         double noise[BR_NE]) {
     if (!v || !variance) return BR_ERROR_NULL;
     double x[1][BR_NX], u[1][BR_NU], found[1][BR_NE];
     memcpy(x, v, sizeof x);
     memcpy(u, v + BR_NX, sizeof u);
-    br_stages_variances(believed(mpc), 1, x, u, mpc->caution.correlations, found);
+    const br_gp *gp = believed(mpc);
+    br_stages_variances(gp, 1, x, u, mpc->caution.correlations, found);
     memcpy(variance, found, sizeof found);
+    for (int j = 0; noise && j < BR_NE; ++j) noise[j] = gp->variance[j].noise;
     return BR_OK;
 }
 

@@ -135,7 +135,7 @@ def test_states_are_estimated_by_the_proven_weights_while_others_are_watched(
 
     def believed() -> bytes:
         after, *_ = step.propagate(v[:7], v[7:], STEP_S, np.zeros(3))
-        return after.tobytes() + step.variance(v).tobytes()
+        return after.tobytes() + b"".join(one.tobytes() for one in step.variance(v))
 
     found = []
     for weights in (honest, again):
