@@ -19,7 +19,6 @@
 #define INTERVALS 5.0  /* of silence, ... */
 #define SILENT_S 0.15  /* ... and at least so long: motion capture has gaps of 100 ms */
 #define USUAL 2.0      /* intervals between two that are used, one of which may be lost or wrong */
-#define ERRING 0.25    /* share of the largest accelerations that a model's may be wrong by */
 #define NEAR 0.5       /* share of the bounds on contradictions of measured states (br_state.c) */
 #define FARTHEST 3.0   /* of that on positions */
 #define FORGETTING 0.1 /* of the mean interval, by each one */
@@ -77,11 +76,11 @@ static br_fault kind_of(int state) {
 }
 
 /* What a model may err in a state by while nothing is measured for so long: its accelerations are
- * wrong by a share of the largest. */
+ * wrong by the largest, as in a slide beyond what its weights have seen. */
 static double erring(br_fault kind, double blind_s) {
     const int turns = kind == BR_FAULT_HEADING || kind == BR_FAULT_YAW_RATE;
     const double along = BR_MONITOR_ACCELERATION_MPS2, about = BR_MONITOR_YAW_ACCELERATION_RADPS2;
-    const double velocity = ERRING * (turns ? about : along) * blind_s;
+    const double velocity = (turns ? about : along) * blind_s;
     if (kind == BR_FAULT_STEERING) return 0;
     return kind == BR_FAULT_POSITION || kind == BR_FAULT_HEADING ? velocity * blind_s / 2
                                                                  : velocity;
