@@ -241,6 +241,20 @@ def test_one_state_of_another_kind_or_date_does_not_end_driving(race: Racing, na
     assert set(loop.driver.instruments) == {"pose"}
 
 
+@pytest.mark.parametrize("lost", [1, 2])
+def test_lost_states_leave_the_steering_angle_known(race: Racing, lost: int) -> None:
+    """Though the next one tells only what acted in its own period; the commands sent are known."""
+    loop = Seen(race, mocap())
+    begins = range(40, 100, 15)
+    gone = [k for first in begins for k in range(first, first + lost)]
+    loop.arriving = lambda seen, _: None if round(seen.time_s / 0.02) in gone else seen
+    driven = loop.drive(0, max_time_s=2.0, x0=race.moments(4)[1])
+    after = [first + lost for first in begins]
+    off = [abs(driven.x[k, 6] - driven.estimates[k][6]) for k in after]
+    assert max(off) < 2e-3
+    assert set(driven.levels[20:]) == {Level.SOLUTION}
+
+
 def test_a_car_whose_states_are_measured_after_all_is_driven(race: Racing) -> None:
     loop = Seen(race, mocap())
     loop.arriving = lambda seen, true: true if seen.time_s else seen

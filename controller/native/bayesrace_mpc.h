@@ -364,8 +364,8 @@ BR_API br_mpc_error br_mpc_set_instructions(br_mpc *mpc, br_instructions instruc
 BR_API br_instructions br_mpc_get_instructions(const br_mpc *mpc);
 
 /* Posterior variance of the residual at v = [x; u], noise included; 0 where it is not known; and,
- * where noise is not NULL, that of the noise alone. By the
- * proven weights, if they correct anything. */
+ * where noise is not NULL, that of the noise alone. By the proven weights, if they correct
+ * anything. */
 BR_API br_mpc_error br_mpc_variance(br_mpc *mpc, const double v[BR_NV], double variance[BR_NE],
                                     double noise[BR_NE]);
 

@@ -225,14 +225,17 @@ static void foresee(br_cycle *cycle) {
 /* Over the periods whose states were lost, by the inputs that had been sent. */
 static void catch_up(br_cycle *cycle) {
     br_estimator *estimator = &cycle->estimator;
-    const double interval_s = cycle->counters.interval_s;
+    const double newest_s = cycle->stream.newest.time_s, interval_s = cycle->counters.interval_s;
     if (cycle->unknown || !estimator->count || !(interval_s > 0)) return;
-    const double last_s = br_estimator_event(estimator, estimator->count - 1)->time_s;
-    const double lost_s = cycle->stream.newest.time_s - interval_s - last_s;
-    const double *u = br_delay_acting(&cycle->delay, last_s + lost_s / 2, cycle->counters.delay_s);
-    if (u && lost_s > interval_s / 2)
-        br_estimator_advance(estimator, last_s + lost_s, u,
-                             cycle->has_residual ? &cycle->residual : NULL, NULL, 0);
+    double last_s = br_estimator_event(estimator, estimator->count - 1)->time_s;
+    if (newest_s - last_s > BR_LONGEST_S) return;
+    for (; newest_s - last_s > 1.5 * interval_s; last_s += interval_s) {
+        const double *u =
+            br_delay_acting(&cycle->delay, last_s + interval_s / 2, cycle->counters.delay_s);
+        const br_residual *residual = cycle->has_residual ? &cycle->residual : NULL;
+        if (!u || br_estimator_advance(estimator, last_s + interval_s, u, residual, NULL, 0))
+            return;
+    }
 }
 
 /* Of the step from the estimate before to this one. The car's own step differs from the model's by

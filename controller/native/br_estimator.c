@@ -14,7 +14,6 @@
 
 #if BR_HAS_PATH
 
-#define LONGEST_S 1.0  /* without position, or between two periods; after that it begins anew */
 #define BEGINNING 0.25 /* share of the gate until a second pose has agreed with the first */
 #define WIDEST 100.0   /* by how much one measurement may widen the covariance */
 #define APART_S 0.2    /* between two poses whose difference is a velocity */
@@ -200,7 +199,7 @@ static const br_measurement *first_pose(const br_estimator *estimator,
                                         double latest_s) {
     const br_measurement *first = NULL;
     for (const br_measurement *m = measurements; m < measurements + count; ++m) {
-        if (!valid(m) || m->time_s > latest_s || m->time_s < latest_s - LONGEST_S) continue;
+        if (!valid(m) || m->time_s > latest_s || m->time_s < latest_s - BR_LONGEST_S) continue;
         if (!of_pose(m) || br_instrument_holds(&estimator->instrument[m->instrument], m)) continue;
         if (!first || m->time_s < first->time_s) first = m;
     }
@@ -306,7 +305,7 @@ static int place(br_estimator *estimator, const br_measurement *m) {
 static void lose(br_estimator *estimator, const br_measurement *m, double time_s) {
     if (m->instrument < 0 || m->instrument >= BR_INSTRUMENTS) return;
     br_instrument *instrument = &estimator->instrument[m->instrument];
-    const int early = estimator->count < BR_EVENTS && m->time_s >= time_s - LONGEST_S;
+    const int early = estimator->count < BR_EVENTS && m->time_s >= time_s - BR_LONGEST_S;
     instrument->lost += 1;
     if (m->time_s <= time_s + BR_SAME_S && early && valid(m)) return;
     br_instrument_bad(instrument, BR_FAULT_TIME);
@@ -452,10 +451,10 @@ static br_mpc_error period(br_estimator *estimator, const br_event *given,
 /* Whether the newest period is too long ago; or, where there is a pose, the newest pose is. */
 static int outdated(br_estimator *estimator, double time_s, int pose) {
     const double newest_s = br_estimator_event(estimator, estimator->count - 1)->time_s;
-    if (time_s - newest_s > LONGEST_S) return 1;
+    if (time_s - newest_s > BR_LONGEST_S) return 1;
     int contradicted;
     br_estimator_blind(estimator, &contradicted);
-    return pose && time_s - estimator->posed_s > LONGEST_S && !contradicted;
+    return pose && time_s - estimator->posed_s > BR_LONGEST_S && !contradicted;
 }
 
 br_mpc_error br_estimator_advance(br_estimator *estimator, double time_s, const double u[BR_NU],

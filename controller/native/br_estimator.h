@@ -6,6 +6,7 @@
 
 #define BR_SAME_S 1e-9        /* times closer than that are one */
 #define BR_NA (BR_NB + BR_NE) /* with accelerations */
+#define BR_LONGEST_S 1.0      /* without position, or between two periods: then it begins anew */
 
 #if BR_HAS_PATH
 /* The states that the residuals correct. */
