@@ -81,10 +81,7 @@ def smoothed_again(
     x, x_next, deviation = dataset.x.copy(), dataset.x_next.copy(), estimates.deviation.copy()
     likelihood, count = 0.0, 0
     for number, drive in enumerate(estimates.drives):
-        try:
-            found = smooth(drive, dataset.car, discretisation, weights)
-        except np.linalg.LinAlgError:  # what is believed has run away
-            found = None
+        found = smooth(drive, dataset.car, discretisation, weights)
         own = np.flatnonzero(estimates.origin[:, 0] == number)
         if found is None:
             return dataset, -math.inf

@@ -211,12 +211,26 @@ def smooth(
     for _ in range(_LINEARISED):
         model = _corrected(events, path[:, :_NB], car, discretisation, weights)
         x0, p0 = _start(events[0], drive, car, path[0, :_NB])
-        made = _forward(events, x0[None], p0[None], model, car.tuning.estimator.gate)
-        found = _backward(events, made)
+        try:
+            with np.errstate(over="ignore", invalid="ignore"):
+                made = _forward(events, x0[None], p0[None], model, car.tuning.estimator.gate)
+                found = _backward(events, made)
+        except np.linalg.LinAlgError:  # what is believed has run away
+            return None
         path = found.path
-        if not np.isfinite(path).all():
+        if not _possible(path, car):
             return None
     return found
+
+
+def _possible(path: Floats, car: CarParameters) -> bool:
+    """Whether a controller would accept all of its states."""
+    most = car.tuning.plausible
+    bounds = np.array([
+        most.position_m, most.position_m, most.heading_rad, most.speed_mps, most.speed_mps,
+        most.yaw_rate_radps, most.steering_rad,
+    ])  # fmt: skip
+    return bool((np.abs(path[:, :_NX]) <= bounds).all())
 
 
 def _start(first: Event, drive: Drive, car: CarParameters, around: Floats) -> tuple[Floats, Floats]:

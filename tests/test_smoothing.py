@@ -155,6 +155,24 @@ def test_it_is_what_all_readings_at_once_say(
             assert np.abs((found.cross[k - 1] - blocks[i, :, ends[k - 1]]) / unit).max() < 1e-3
 
 
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("times", [1e4, 1e25])
+def test_nothing_is_made_of_a_drive_that_the_model_cannot_follow(
+    make: Make, car: CarParameters, weights: GpWeights, times: float
+) -> None:
+    """It runs away, to where no car can be, or beyond all numbers."""
+    random, step = np.random.default_rng(2), make()
+    _, u = smooth_drive(car, 40, 2)
+    x = [np.array([0.3, -0.2, 3.0, 1.5, 0, 0, 0])]
+    for given in u:
+        x.append(step.predict(x[-1], given, STEP_S))
+    readings = poses(random, np.array(x))
+    vx, vy, omega = weights.outputs
+    wild = replace(weights, outputs=(vx, vy, replace(omega, y_scale=times * omega.y_scale)))
+    assert smooth(of(np.array(x), u, readings), car, PREDICTION, weights) is not None
+    assert smooth(of(np.array(x), u, readings), car, PREDICTION, wild) is None
+
+
 def test_what_one_instrument_reads_does_not_keep_another_from_being_heard(
     car: CarParameters,
 ) -> None:
