@@ -243,7 +243,7 @@ def test_one_state_of_another_kind_or_date_does_not_end_driving(race: Racing, na
 
 @pytest.mark.parametrize("lost", [1, 2])
 def test_lost_states_leave_the_steering_angle_known(race: Racing, lost: int) -> None:
-    """Though the next one tells only what acted in its own period; the commands sent are known."""
+    """The next state reports the input of its own period alone; the commands sent tell the rest."""
     loop = Seen(race, mocap())
     begins = range(40, 100, 15)
     gone = [k for first in begins for k in range(first, first + lost)]

@@ -238,40 +238,6 @@ static void catch_up(br_cycle *cycle) {
     }
 }
 
-/* Of the step from the estimate before to this one. The car's own step differs from the model's by
- * something of variance q, of whose covariance c with the prediction's error the correction shows
- * the share corrected / predicted: with e the error of an estimate,
- *
- *   var(e - f e_before) = corrected + q - 2 c corrected / predicted,
- *
- * each state taken by itself. Where measurements say little that is more than is corrected: what
- * they have not shown of the car's step is no error of whatever weights. c is q for what is
- * independent from one step to the next, and more for accelerations that last. */
-static br_mpc_noise noise_of(const br_cycle *cycle, const br_estimate *now, double duration_s) {
-    const br_estimator *estimator = &cycle->estimator;
-    br_mpc_noise noise;
-    double q[BR_NX], c[BR_NX];
-    for (int i = 0; i < BR_NX; ++i)
-        c[i] = q[i] = duration_s * estimator->settings.drift[i] * estimator->settings.drift[i];
-    for (int j = 0; j < BR_NE; ++j) {
-        const int i = BR_RATE[j], acceleration = BR_NB + j;
-        const double left = now->p[i][i] / (now->p[i][i] + estimator->corrected[i]);
-        const br_residual *residual = &cycle->residual;
-        if (!estimator->walks && cycle->has_residual)
-            c[i] = q[i] +=
-                duration_s / BR_TS * (residual->variance[j] - br_estimate_guessed(residual, j));
-        q[i] += duration_s * duration_s * now->p[acceleration][acceleration];
-        c[i] += duration_s * now->p[acceleration][i] / left; /* as it was predicted */
-    }
-    for (int i = 0; i < BR_NX; ++i) {
-        const double corrected = estimator->corrected[i], predicted = now->p[i][i] + corrected;
-        const double shown = predicted > 0 ? corrected / predicted : 0;
-        noise.corrected[i] = corrected;
-        noise.step[i] = fmax(corrected + q[i] - 2 * c[i] * shown, 0);
-    }
-    return noise;
-}
-
 /* What counts of the newest state where it is estimated; whether there is an estimate. */
 static int estimate(br_cycle *cycle, const br_measured *before, br_mpc_noise *noise) {
     br_measured *newest = &cycle->stream.newest;
@@ -289,7 +255,7 @@ static int estimate(br_cycle *cycle, const br_measured *before, br_mpc_noise *no
     cycle->doubt = BR_FAULT_NONE;
     if (!error) {
         const br_estimate *now = br_estimator_now(estimator);
-        *noise = noise_of(cycle, now, newest->time_s - before->time_s);
+        br_estimator_noise(estimator, newest->time_s - before->time_s, noise);
         memcpy(newest->x, now->x, sizeof newest->x);
         cycle->doubt = doubtful(cycle, now);
         if (!cycle->doubt || begins) cycle->monitor.trusted_s = newest->time_s;
@@ -462,7 +428,8 @@ static int begin_step(br_cycle *cycle, double u[BR_NU]) {
     if (!cycle->mpc || !cycle->stream.newest.estimated) return at_acting(cycle, u, NULL);
     br_estimator *estimator = &cycle->estimator;
     br_carried carried = {.estimator = estimator,
-                          .by = br_estimator_event(estimator, estimator->count - 1),
+                          .residual =
+                              &br_estimator_event(estimator, estimator->count - 1)->residual,
                           .at = *br_estimator_now(estimator)};
     double covariance[BR_NX * BR_NX];
     if (at_acting(cycle, u, &carried)) return -1;

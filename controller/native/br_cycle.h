@@ -53,12 +53,12 @@ void br_delay_observe(br_delay *delay, const br_driving *settings, const br_meas
 void br_delay_sent(br_delay *delay, double decided_at_s, const double u[BR_NU]);
 
 /* What acts at a plant time; NULL: not known. */
-const double *br_delay_acting(const br_delay *delay, double time_s, double delay_s);
+const double *br_delay_acting(br_delay *delay, double time_s, double delay_s);
 
 /* An estimate that is predicted beside the state. */
 typedef struct {
     const br_estimator *estimator;
-    const br_event *by; /* whose residual it takes */
+    const br_residual *residual;
     br_estimate at;
 } br_carried;
 

@@ -56,17 +56,12 @@ static inline const br_estimate *br_estimator_now(br_estimator *estimator) {
 /* What is expected of a measured state, its offset included. */
 double br_estimate_observed(const double x[BR_NA], int state);
 
-/* What of the residual's variance is no noise, but a guess: where a Gaussian process has not been
- * trained, its error follows the car's state, and lasts for longer than a stage. */
-static inline double br_estimate_guessed(const br_residual *residual, int j) {
-    const double beyond = residual->variance[j] - 2 * residual->noise[j];
-    return beyond > 0 ? beyond : 0;
-}
-
-/* --- br_motion.c: x and P after a duration, under u --- */
+/* --- br_motion.c: x and P after a duration, under u; and, for a duration up to the newest period's
+ * end, how far the estimated step may differ from the car's --- */
 
 br_mpc_error br_estimator_reach(const br_estimator *estimator, const double u[BR_NU],
                                 const br_residual *residual, double duration, br_estimate *b);
+void br_estimator_noise(br_estimator *estimator, double duration_s, br_mpc_noise *noise);
 
 /* --- br_instrument.c: whether what an instrument reports can be believed --- */
 

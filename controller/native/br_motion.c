@@ -78,10 +78,16 @@ static br_mpc_error walk(const br_estimator *estimator, const br_estimate *b, co
     return BR_OK;
 }
 
+/* What of the residual's variance is no noise, but a guess: where a Gaussian process has not been
+ * trained, its error follows the car's state, and lasts for longer than a stage. */
+static double guessed(const br_residual *residual, int j) {
+    return fmax(residual->variance[j] - 2 * residual->noise[j], 0);
+}
+
 /* The variance of an acceleration: in place of the model, or of what this errs by. */
 static double walking(const br_estimation *s, const br_residual *residual, int j) {
     const double deviation = s->acceleration[j], erring = GUESSING / BR_TS;
-    return deviation * deviation + erring * erring * br_estimate_guessed(residual, j);
+    return deviation * deviation + erring * erring * guessed(residual, j);
 }
 
 /* Accelerations after a duration: less of what they were, and something new. */
@@ -103,8 +109,7 @@ static br_mpc_error propagate(const br_estimator *estimator, const double u[BR_N
     double f[BR_NX * BR_NX], by[BR_NX * BR_NE], q[BR_NX * BR_NX], begin[BR_NX], next[BR_NX];
     double white[BR_NE];
     for (int i = 0; i < BR_NX; ++i) begin[i] = b->x[i] - b->way[i];
-    for (int j = 0; j < BR_NE; ++j)
-        white[j] = residual->variance[j] - br_estimate_guessed(residual, j);
+    for (int j = 0; j < BR_NE; ++j) white[j] = residual->variance[j] - guessed(residual, j);
     const br_mpc_error error = estimator->walks
                                    ? walk(estimator, b, u, duration, next, f, by, q)
                                    : br_mpc_propagate(estimator->mpc, b->x, begin, u, duration,
@@ -131,6 +136,37 @@ br_mpc_error br_estimator_reach(const br_estimator *estimator, const double u[BR
     }
     if (error || duration < BR_SAME_S) return error;
     return propagate(estimator, u, residual, fmin(duration, BR_TS), b);
+}
+
+/* The car's own step differs from the model's by something of variance q, of whose covariance c
+ * with the prediction's error the correction shows the share corrected / predicted: with e the
+ * error of an estimate,
+ *
+ *   var(e - f e_before) = corrected + q - 2 c corrected / predicted,
+ *
+ * each state taken by itself. Where measurements say little that is more than is corrected: what
+ * they have not shown of the car's step is no error of whatever weights. c is q for what is
+ * independent from one step to the next, and more for accelerations that last. */
+void br_estimator_noise(br_estimator *estimator, double duration_s, br_mpc_noise *noise) {
+    const br_estimation *s = &estimator->settings;
+    const br_event *newest = br_estimator_event(estimator, estimator->count - 1);
+    const br_estimate *now = &newest->after;
+    double q[BR_NX], c[BR_NX];
+    for (int i = 0; i < BR_NX; ++i) c[i] = q[i] = duration_s * s->drift[i] * s->drift[i];
+    for (int j = 0; j < BR_NE; ++j) {
+        const int i = BR_RATE[j], acceleration = BR_NB + j;
+        const double left = now->p[i][i] / (now->p[i][i] + estimator->corrected[i]);
+        const double white = newest->residual.variance[j] - guessed(&newest->residual, j);
+        if (!estimator->walks) c[i] = q[i] += duration_s / BR_TS * white;
+        q[i] += duration_s * duration_s * now->p[acceleration][acceleration];
+        c[i] += duration_s * now->p[acceleration][i] / left; /* as it was predicted */
+    }
+    for (int i = 0; i < BR_NX; ++i) {
+        const double corrected = estimator->corrected[i], predicted = now->p[i][i] + corrected;
+        const double shown = predicted > 0 ? corrected / predicted : 0;
+        noise->corrected[i] = corrected;
+        noise->step[i] = fmax(corrected + q[i] - 2 * c[i] * shown, 0);
+    }
 }
 
 #endif

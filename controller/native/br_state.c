@@ -399,9 +399,9 @@ void br_delay_sent(br_delay *delay, double decided_at_s, const double u[BR_NU]) 
     memcpy(one->u, u, sizeof one->u);
 }
 
-const double *br_delay_acting(const br_delay *delay, double time_s, double delay_s) {
+const double *br_delay_acting(br_delay *delay, double time_s, double delay_s) {
     for (int i = delay->count - 1; i >= 0; --i) {
-        const br_sent *one = &delay->sent[(delay->first + i) % BR_SENT];
+        const br_sent *one = sent(delay, i);
         if (one->decided_at_s + delay_s <= time_s) return one->u;
     }
     return NULL;
@@ -410,7 +410,7 @@ const double *br_delay_acting(const br_delay *delay, double time_s, double delay
 static int carry(const br_controller *controller, double x[BR_NX], const double u[BR_NU],
                  double duration_s, br_carried *carried) {
     if (carried &&
-        br_estimator_reach(carried->estimator, u, &carried->by->residual, duration_s, &carried->at))
+        br_estimator_reach(carried->estimator, u, carried->residual, duration_s, &carried->at))
         return -1;
     return controller->predict(controller->self, x, u, duration_s, x) ? -1 : 0;
 }
