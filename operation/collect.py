@@ -2,8 +2,9 @@
 
 A racing line touches the edges of the track, and a driver that is disturbed on purpose, and slides,
 leaves it there. So the drive follows the racing line where that leaves room to the edges, and else
-a line made of it. A drive that leaves the track is driven again, slower, and so is one in which the
-fallback has to brake often, because the car was lost sight of.
+a line made of it. A drive that leaves the track or spins is driven again, slower where it did, and
+so is one in which the fallback has to brake often, because the car was lost sight of. Elsewhere it
+stays as fast: a residual is known at the speeds only that were driven.
 """
 
 from dataclasses import replace
@@ -12,7 +13,7 @@ from typing import Final
 
 import numpy as np
 
-from bayesrace.arrays import Floats
+from bayesrace.arrays import Flags, Floats
 from bayesrace.controller.pure_pursuit import DrivingStyle, PurePursuit, PurePursuitSettings
 from bayesrace.controller.python_controller import PythonController
 from bayesrace.log import LogWriter
@@ -26,19 +27,23 @@ from bayesrace.tracks.spline import fit_arc_length
 from bayesrace.vehicles import CarParameters, car_text
 
 __all__ = [
-    "collect", "drive_length_s", "pursuit_controller", "room_beside", "training_line",
-    "training_margin_m",
+    "collect", "drive_length_s", "pursuit_controller", "room_beside", "slower_before",
+    "training_line", "training_margin_m",
 ]  # fmt: skip
 
-_ATTEMPTS: Final = 8
-_SLOWER: Final = 0.93
-"""Speed of an attempt over that of the one before; that of the last is 0.6 times the style's."""
+_ATTEMPTS: Final = 10
+_SLOWER: Final = 0.85
+"""Speed over that of the attempt before, where something went wrong ..."""
+_BEFORE_S: Final = 0.8
+"""... and for so long before; within as much time before that it falls."""
 _FALLBACK: Final = 0.1
 """Share of the cycles that the fallback may drive."""
 _MOST: Final = 0.3
 """Of a track's width: the most that the line keeps from each edge."""
 _LAPS: Final = 1.5
 """Of the line, flying: the least length of a drive, which begins at rest and is slower."""
+_ESTIMATED: Final = 2.0
+"""Times that length where states are estimated."""
 _WAVE: Final = 0.4
 """Amplitude of the weaving style, over the room that the line keeps ..."""
 _WAVELENGTH: Final = 32.0
@@ -60,8 +65,9 @@ def collect(
     sensors: Sensors = EXACT,
     delay_s: float = 0.0,
 ) -> Driven:
-    """Drives for ``duration_s`` and logs the run at ``path``: the first that stays on the track and
-    is driven to its end, or the slowest. With a ``speed_scale`` in ``settings`` there is but one.
+    """Drives for ``duration_s`` and logs the run at ``path``: the first that stays on the track,
+    does not spin and is driven to its end, or the last. With a ``speed_scale`` in ``settings``
+    there is but one.
 
     ``sensors``, ``delay_s``: as in :class:`ClosedLoop`, the seed is that of ``settings``.
 
@@ -70,13 +76,15 @@ def collect(
     Raises FmuFault if it fails.
     """
     followed = training_line(track, line, car, settings.style)
-    room_m, columns = room_beside(track, followed), (followed.x_m, followed.y_m, followed.vx_mps)
-    vehicle = vehicle or built_in_car(car)
+    room_m, vehicle = room_beside(track, followed), vehicle or built_in_car(car)
+    speeds = followed.vx_mps
     for attempt in range(1 if settings.speed_scale else _ATTEMPTS):
-        scale = settings.scale * _SLOWER**attempt
-        slower = settings.model_copy(update={"speed_scale": scale})
-        pursuit = PurePursuit(car, *columns, slower, room_m=room_m)
-        about = {"track": track.name, "car": car_text(car), "speed_scale": f"{scale:.3g}"}
+        pursuit = PurePursuit(car, followed.x_m, followed.y_m, speeds, settings, room_m=room_m)
+        scale = settings.scale * float(np.mean(speeds / followed.vx_mps))
+        about = {
+            "track": track.name, "car": car_text(car),
+            "attempts": str(attempt + 1), "speed_scale": f"{scale:.3g}",
+        }  # fmt: skip
         log = LogWriter(path, {"collect": about})
         try:
             loop = ClosedLoop(
@@ -88,10 +96,30 @@ def collect(
             log.close()
         if driven.end.reason == "plant_fault":
             raise FmuFault(driven.end.text)
-        left = float(track.project_path(driven.x[:, :2]).off_track_m.max()) > 0
-        if not left and driven.fallbacks <= _FALLBACK * len(driven.levels):
-            break
+        wrong = track.project_path(driven.x[:, :2]).off_track_m > 0
+        wrong |= np.abs(driven.slip_rad) > car.tuning.gate.spin_rad
+        if not wrong.any():
+            if driven.fallbacks <= _FALLBACK * len(driven.levels):
+                break
+            wrong[: len(driven.levels)] = driven.levels > 0
+        speeds = speeds * slower_before(followed, driven, wrong)
     return driven
+
+
+def slower_before(line: RaceLine, driven: Driven, wrong: Flags) -> Floats:
+    """Shares of the line's speeds, (n,), by which a drive is to be slower where it led to samples
+    that are ``wrong`` (m,), one for each of its states."""
+    share: Floats = np.ones(len(line.s_m))
+    place = [int(np.argmin(np.sum((line.xy_m - at) ** 2, axis=1))) for at in driven.x[:, :2]]
+    for begin in np.flatnonzero(wrong & ~np.roll(wrong, 1)):
+        ahead_s = driven.time_s[begin] - driven.time_s[: begin + 1]
+        by = (1 - _SLOWER) * np.clip(2 - ahead_s / _BEFORE_S, 0, 1)
+        for k in np.flatnonzero(by):
+            passed = np.arange(1 + (place[min(k + 1, begin)] - place[k]) % len(share))
+            if len(passed) < len(share) / 2:  # else the car was driven backwards
+                rows = (place[k] + passed) % len(share)
+                share[rows] = np.minimum(share[rows], 1 - by[k])
+    return share
 
 
 def pursuit_controller(
@@ -124,9 +152,11 @@ def training_margin_m(track: Track, car: CarParameters, margin_m: float | None =
     return max(room_m, car.width_m / 2 if margin_m is None else margin_m)
 
 
-def drive_length_s(car: CarParameters, line: RaceLine) -> float:
-    """Length of a training drive along a line, by default: a lap at least."""
-    return max(car.tuning.pursuit.drive_s, _LAPS * line.lap_time_s)
+def drive_length_s(car: CarParameters, line: RaceLine, sensors: Sensors = EXACT) -> float:
+    """Length of a training drive along a line, by default: a lap at least; longer where states are
+    estimated, as such a sample says less."""
+    length_s = max(car.tuning.pursuit.drive_s, _LAPS * line.lap_time_s)
+    return _ESTIMATED * length_s if sensors.root else length_s
 
 
 def training_line(

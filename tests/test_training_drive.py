@@ -19,10 +19,17 @@ from bayesrace.controller import pure_pursuit
 from bayesrace.controller.pure_pursuit import DrivingStyle, PurePursuitSettings
 from bayesrace.log import LogReader
 from bayesrace.operation.closed_loop import Driven, built_in_car
-from bayesrace.operation.collect import collect, drive_length_s, training_line, training_margin_m
+from bayesrace.operation.collect import (
+    collect,
+    drive_length_s,
+    slower_before,
+    training_line,
+    training_margin_m,
+)
 from bayesrace.operation.report import write_report
 from bayesrace.operation.terminal.tables import print_table
 from bayesrace.raceline import RaceLine, write_raceline
+from bayesrace.sensors import get_sensors
 from bayesrace.tracks import Track, load_track, write_track
 from bayesrace.vehicles import get_car
 from tests.command_line import Cli
@@ -97,8 +104,32 @@ def test_a_drive_in_which_the_car_is_lost_sight_of_is_driven_again_slower(
     )
     monkeypatch.setattr("bayesrace.operation.collect.PythonController", lambda *_: None)
     assert collect(TRACK, at_the_edge(), CAR, tmp_path, log, 12.0, PurePursuitSettings()) is whole
-    scale = float(LogReader(log).metadata()["collect"]["speed_scale"])
-    assert scale == pytest.approx(pure_pursuit._SCALES["limit"] * 0.93, abs=6e-3)
+    about = LogReader(log).metadata()["collect"]
+    assert about["attempts"] == "2"
+    assert 0.85 < float(about["speed_scale"]) / pure_pursuit._SCALES["limit"] < 1
+
+
+def test_a_drive_is_slower_only_where_something_went_wrong(
+    driven: dict[DrivingStyle, tuple[Driven, Path]],
+) -> None:
+    """Before the place, less and less the earlier it was; across the line's first point, too."""
+    one, _ = driven["calm"]
+    line = training_line(TRACK, at_the_edge(), CAR, "calm")
+    nearest = [int(np.argmin(np.hypot(*(line.xy_m - at).T))) for at in one.x[:, :2]]
+    begin = next(k for k in range(300, 600) if nearest[k] < nearest[k - 1])
+    wrong = np.zeros(len(one.x), dtype=bool)
+    wrong[begin : begin + 20] = True
+    share = slower_before(line, one, wrong)
+    assert share[nearest[begin]] == share[nearest[begin - 30]] == pytest.approx(0.85)
+    assert share[nearest[begin - 60]] == pytest.approx(0.925, abs=0.01)
+    assert share[nearest[begin - 90]] == share[nearest[begin + 5]] == 1
+    steps = np.abs(np.diff(np.append(share, share[0])))
+    assert np.sort(steps)[:-1].max() < 0.02, "it begins at the place, and nowhere else at once"
+
+
+def test_a_drive_of_estimated_states_lasts_twice_as_long() -> None:
+    estimated = drive_length_s(CAR, at_the_edge(), get_sensors("mocap"))
+    assert estimated == 2 * drive_length_s(CAR, at_the_edge())
 
 
 def test_a_line_with_room_is_followed_as_it_is() -> None:
