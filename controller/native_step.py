@@ -437,6 +437,7 @@ class NativeStep(NativeProblem):
         """InputError if it was built for another car."""
         super().__init__(artefact)
         self.manifest.check_car(car, artefact)
+        self._line_mps, self._spacing_m = np.zeros(0), 0.0
         self.set_parameters(car, settings)
 
     def set_parameters(self, car: CarParameters, settings: MpcSettings) -> None:
@@ -449,6 +450,19 @@ class NativeStep(NativeProblem):
         count = len(table.rows)
         error = self._library.br_mpc_set_path(self.handle, rows, count, table.spacing_m)
         self._check(error, "path")
+        self._line_mps, self._spacing_m = table.rows[:, 2].copy(), table.spacing_m
+
+    def speeds(self) -> Floats:
+        """The line's speeds at the path's rows (n,), as far as the weights in use know the car. The
+        thread that stages weights may ask, too."""
+        made, given = self._made(count := len(self._line_mps))
+        self._check(self._library.br_mpc_get_speeds(self.handle, given, count), "speeds")
+        return made
+
+    @property
+    def unknown_s(self) -> float:
+        """What a lap loses to the line because the weights in use do not know the car there."""
+        return self._spacing_m * float((1 / self.speeds() - 1 / self._line_mps).sum())
 
     def set_weights(self, weights: GpWeights) -> None:
         """Uses the weights from the next step on; InputError if they are for another model."""

@@ -12,15 +12,16 @@ from bayesrace.arrays import Floats
 from bayesrace.codegen.problems.tracking import tracking
 from bayesrace.controller.assembly import compiled_controller
 from bayesrace.controller.native_step import NativeStep, StepStatus
+from bayesrace.controller.pure_pursuit import PurePursuitSettings
 from bayesrace.controller.settings import MpcSettings
 from bayesrace.gp.weights import KERNELS, GpWeights, read_weights
 from bayesrace.integrators import PREDICTION
 from bayesrace.learning.validation import predictive_sigma
-from bayesrace.operation.closed_loop import ClosedLoop, built_in_car
+from bayesrace.operation.closed_loop import ClosedLoop
 from bayesrace.operation.preparation import prepare
 from bayesrace.operation.settings import RaceSettings
 from bayesrace.operation.terminal.terminal import stages_on
-from bayesrace.vehicles import CarParameters, default_car
+from bayesrace.vehicles import CarParameters
 from bayesrace.vehicles.models import dynamic, e_kinematic
 from bayesrace.vehicles.tuning import CautionTuning
 from tests.conftest import CAUTIOUS, Circuit, Make, discrete, fit_weights, smooth_drive
@@ -144,11 +145,13 @@ def test_the_car_slows_down_where_it_knows_little_and_speeds_up_again(
     step = make(of_points(weights, 2), caution=0.9999999)
     x, u, paces = driven(step, car, circuit.start(), np.zeros(2), 60)
     step.set_weights(weights)
-    step.set_parameters(car, CAUTIOUS)
+    step.set_parameters(car, CAUTIOUS.model_copy(update={"caution": 0.6}))
+    assert step.unknown_s == 0
+    least, paces = min(paces), paces[-1:]
     paces += driven(step, car, x, u, 120)[2]
     tuning = car.tuning.caution
     changes = np.diff(paces) / np.array(paces[:-1]) / PREDICTION.step_s
-    assert min(paces[:60]) == tuning.least
+    assert least == tuning.least
     assert paces[-1] == 1.0
     assert changes.min() >= -tuning.slower_ps * (1 + 1e-9)
     assert changes.max() <= tuning.faster_ps * (1 + 1e-9)
@@ -166,7 +169,7 @@ def test_the_reference_does_not_leap_when_nothing_is_uncertain_any_more(
     assert step.step(x, u).usable
     assert paces[-1] < 0.9
     faster = 1 + car.tuning.caution.faster_ps * PREDICTION.step_s
-    assert step.info.pace == pytest.approx(faster * paces[-1])
+    assert paces[-1] <= step.info.pace <= faster * paces[-1] * (1 + 1e-9)
 
 
 @pytest.mark.parametrize(("side", "bound"), [(1, 5), (-1, 4)])
@@ -229,14 +232,9 @@ def test_shares_in_the_tuning_are_shares(car: CarParameters, change: dict[str, f
         CautionTuning.model_validate(stated)
 
 
-@pytest.mark.check
-def test_first_laps_on_slippery_tyres_stay_on_the_track() -> None:
-    """The tyres give 18 % less than the racing line asks for: the plan leaves what was driven.
-
-    The samples' mirror images alone would keep this car on this track.
-    """
-    one_sided = default_car().model_copy(update={"mirrored_samples": False})
-    settings = RaceSettings(track="harbour", true_grip=0.82, car=one_sided)
+def test_first_laps_faster_than_all_training_stay_on_the_track() -> None:
+    """The car was driven at half of the line's speed: the plan leaves what was driven."""
+    settings = RaceSettings(track="harbour", pursuit=PurePursuitSettings(speed_scale=0.5))
     with stages_on(Console(quiet=True)) as stages:
         files = prepare(settings, (settings.track,), stages)
     weights = read_weights(files.weights)
@@ -244,7 +242,6 @@ def test_first_laps_on_slippery_tyres_stay_on_the_track() -> None:
     for mpc in (MpcSettings(caution=0.0), MpcSettings()):
         on, line, car = files.first.track, files.first.line, settings.car
         controller = compiled_controller(files.artefacts[0], car, on, line, weights, mpc)
-        loop = ClosedLoop(car, on, line, controller, built_in_car(settings.true_car))
-        deepest.append(float(loop.drive(2).off_track_m.max()))
+        deepest.append(float(ClosedLoop(car, on, line, controller).drive(2).off_track_m.max()))
     assert deepest[0] > 0.05
     assert deepest[1] <= 0

@@ -259,11 +259,15 @@ class CautionTuning(_Section):
     slower_ps: float = _number(2.5, "speed of the reference then falls at this rate [1/s]")
     faster_ps: float = _number(0.5, "and rises again at this one [1/s]")
     least: float = _number(0.5, "share of the line's speed that is never undercut [-]", gt=0, le=1)
+    notice_s: float = _number(0.2, "in which feedback notices what the model errs by [s]")
 
     @property
     def pace(self) -> list[tuple[str, float]]:
         """The numbers that the controller's planner is compiled with."""
-        names = {"share": "share", "slower": "slower_ps", "faster": "faster_ps", "least": "least"}
+        names = {
+            "share": "share", "slower": "slower_ps", "faster": "faster_ps", "least": "least",
+            "notice_s": "notice_s",
+        }  # fmt: skip
         return [(key, getattr(self, name)) for key, name in names.items()]
 
 

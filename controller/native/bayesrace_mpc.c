@@ -80,14 +80,22 @@ static int valid(const br_mpc_parameters *p) {
            p->iterations >= 1 && p->iterations_cold >= 1 && br_valid_parameters(p);
 }
 
+static void limit_speeds(br_mpc *mpc);
+
 br_mpc_error br_mpc_set_parameters(br_mpc *mpc, const br_mpc_parameters *parameters) {
     if (!mpc || !parameters) return BR_ERROR_NULL;
     if (!valid(parameters)) return BR_ERROR_PARAMETERS;
+    const int others =
+        !mpc->has_parameters || memcmp(&mpc->parameters, parameters, sizeof *parameters) != 0;
     mpc->parameters = *parameters;
     mpc->has_parameters = 1;
     br_invalidate(mpc, BR_TUBE);
     br_innovation_undo(&mpc->innovation);
     br_evaluate_penalties(mpc);
+    mpc->caution.wanted = 0;
+    for (int r = 0; r < BR_NR && parameters->caution_sigmas > 0; ++r)
+        if (BR_ROW_CAUTIOUS[r] && mpc->qp.penalty[r] > 0) mpc->caution.wanted = 1;
+    if (others) limit_speeds(mpc);
     return BR_OK;
 }
 
@@ -95,7 +103,9 @@ br_mpc_error br_mpc_set_path(br_mpc *mpc, const double *table, int n, double spa
     if (!mpc || !table) return BR_ERROR_NULL;
 #if BR_HAS_PATH
     br_invalidate(mpc, BR_FOLLOWED); /* what has been prepared is of the path before */
-    return br_path_load(&mpc->path, table, n, spacing_m);
+    const br_mpc_error error = br_path_load(&mpc->path, table, n, spacing_m);
+    if (!error) limit_speeds(mpc);
+    return error;
 #else
     (void)n, (void)spacing_m;
     return BR_ERROR_PATH;
@@ -151,6 +161,16 @@ br_mpc_error br_mpc_get_reference(const br_mpc *mpc, br_mpc_reference reference[
     memcpy(reference, mpc->answer_reference, sizeof mpc->answer_reference);
     return BR_OK;
 }
+
+#if BR_HAS_PATH
+br_mpc_error br_mpc_get_speeds(const br_mpc *mpc, double *speeds_mps, int n) {
+    if (!mpc || !speeds_mps) return BR_ERROR_NULL;
+    if (!mpc->path.ready) return BR_ERROR_NOT_READY;
+    if (n != mpc->path.n) return BR_ERROR_PATH;
+    memcpy(speeds_mps, mpc->path.speed[mpc->path.buffer], (size_t)n * sizeof *speeds_mps);
+    return BR_OK;
+}
+#endif
 
 br_mpc_error br_mpc_get_tube(const br_mpc *mpc, double tube[BR_N]) {
     if (!mpc || !tube) return BR_ERROR_NULL;
@@ -240,9 +260,29 @@ static void hand_over(br_mpc *mpc, int owner) {
     atomic_store_explicit(&mpc->spare, owner, memory_order_release);
 }
 
+/* Speeds of the line anew, for other parameters or another line, by all weights that are loaded. */
+static void limit_speeds(br_mpc *mpc) {
+#if BR_HAS_PATH
+    mpc->code->limit(mpc, mpc->gp_in_use);
+    if (mpc->gp_proven != mpc->gp_in_use) mpc->code->limit(mpc, mpc->gp_proven);
+    if (take_from(mpc, BR_SPARE_STAGED)) {
+        mpc->code->limit(mpc, mpc->gp_spare);
+        hand_over(mpc, BR_SPARE_STAGED);
+    }
+#else
+    (void)mpc;
+#endif
+}
+
 /* Other weights are in use from the next step on. */
 static void use(br_mpc *mpc, int buffer) {
     mpc->gp_in_use = buffer;
+#if BR_HAS_PATH
+    /* a reference that knows more does not leap ahead */
+    const double before = br_path_pace(&mpc->path, 1);
+    mpc->path.buffer = buffer;
+    mpc->caution.pace *= fmin(before / br_path_pace(&mpc->path, 1), 1);
+#endif
     mpc->watch.since = mpc->watch.count;
     memset(mpc->watch.judged, 0, sizeof mpc->watch.judged);
     br_forget_linearisation(mpc);
@@ -257,10 +297,19 @@ static void exchange(br_mpc *mpc) {
     use(mpc, after);
 }
 
+/* Into the spare buffer, which the caller has taken. */
+static br_mpc_error load(br_mpc *mpc, const br_mpc_gp outputs[BR_NE]) {
+    const br_mpc_error error = mpc->code->load(&mpc->gp[mpc->gp_spare], outputs);
+#if BR_HAS_PATH
+    if (!error) mpc->code->limit(mpc, mpc->gp_spare);
+#endif
+    return error;
+}
+
 br_mpc_error br_mpc_stage_weights(br_mpc *mpc, const br_mpc_gp outputs[BR_NE]) {
     if (!mpc || !outputs) return BR_ERROR_NULL;
     if (!take_from(mpc, BR_SPARE_STAGED) && !take_from(mpc, BR_SPARE_FREE)) return BR_ERROR_BUSY;
-    const br_mpc_error error = mpc->code->load(&mpc->gp[mpc->gp_spare], outputs);
+    const br_mpc_error error = load(mpc, outputs);
     hand_over(mpc, error ? BR_SPARE_FREE : BR_SPARE_STAGED);
     return error;
 }
@@ -276,7 +325,7 @@ br_mpc_error br_mpc_adopt_weights(br_mpc *mpc) {
 br_mpc_error br_mpc_set_weights(br_mpc *mpc, const br_mpc_gp outputs[BR_NE]) {
     if (!mpc || !outputs) return BR_ERROR_NULL;
     if (!take_from(mpc, BR_SPARE_STAGED) && !take_from(mpc, BR_SPARE_FREE)) return BR_ERROR_BUSY;
-    const br_mpc_error error = mpc->code->load(&mpc->gp[mpc->gp_spare], outputs);
+    const br_mpc_error error = load(mpc, outputs);
     if (!error) exchange(mpc); /* else the weights in use stay */
     hand_over(mpc, BR_SPARE_FREE);
     return error ? error : br_mpc_prove_weights(mpc);

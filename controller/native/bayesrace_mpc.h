@@ -195,8 +195,9 @@ BR_API br_mpc_error br_mpc_set_parameters(br_mpc *mpc, const br_mpc_parameters *
 BR_API br_mpc_error br_mpc_set_path(br_mpc *mpc, const double *table, int n, double spacing_m);
 
 /* Copies the weights and, where signal is given, makes what the posterior variance needs; the next
- * step uses them. Some 4 ms per 400 points and output. What is staged is forgotten. BR_ERROR_BUSY
- * while another thread stages. */
+ * step uses them. Some 4 ms per 400 points and output, and 0.1 ms per wheelbase of the path for its
+ * speeds (br_mpc_get_speeds), which another path or other parameters change, too. What is staged is
+ * forgotten. BR_ERROR_BUSY while another thread stages. */
 BR_API br_mpc_error br_mpc_set_weights(br_mpc *mpc, const br_mpc_gp outputs[BR_NE]);
 
 /* The same in two parts, for a control loop that has no time to copy. br_mpc_stage_weights copies
@@ -350,6 +351,13 @@ BR_API br_mpc_error br_mpc_rehearse(br_mpc *mpc);
  * wanted; and the stage parameters that it was made with. br_mpc_prepare changes neither. */
 BR_API br_mpc_error br_mpc_get_plan(const br_mpc *mpc, double *x, double *u);
 BR_API br_mpc_error br_mpc_get_reference(const br_mpc *mpc, br_mpc_reference reference[BR_N]);
+
+#if BR_HAS_PATH
+/* The speeds that the car is to reach at the path's n rows: the line's, lower where the weights in
+ * use do not know the car well enough. Without caution, or where the residual's variance is not
+ * known, the line's. The thread that stages weights may ask, too. */
+BR_API br_mpc_error br_mpc_get_speeds(const br_mpc *mpc, double *speeds_mps, int n);
+#endif
 
 /* How uncertain the last step's plan is: for each stage, half the width that uncertainty takes of
  * the rows that it tightens, the largest [the row's unit]. 0 without caution. */

@@ -58,7 +58,20 @@ typedef struct {
     double s;                             /* arc length of the last projection */
     double speed_limit, speed_limit_rate; /* of the environment */
     double age;                           /* time since then */
+    int buffer;                           /* of the speeds that count: as of the weights in use */
+    double speed[3][BR_PATH_CAPACITY];    /* as far as these know: see br_certainty.c */
 } br_path;
+
+/* Columns of the path's table. */
+enum {
+    BR_LINE_X,
+    BR_LINE_Y,
+    BR_LINE_SPEED,
+    BR_LINE_NORMAL_X,
+    BR_LINE_NORMAL_Y,
+    BR_LINE_LOWER,
+    BR_LINE_UPPER
+};
 
 typedef struct {
     int regularised;  /* the exact Hessian was not positive definite */
@@ -144,6 +157,8 @@ typedef struct {
 
 /* What the residual's uncertainty does to the plan: see br_caution.c. */
 typedef struct {
+    int wanted; /* by the parameters: there are rows to be cautious about, and standard deviations
+                 */
     int active; /* there is an uncertainty to be cautious about */
     int given;  /* covariance of the step at hand; it becomes begin after it: */
     double covariance[BR_NX][BR_NX];
@@ -193,6 +208,9 @@ typedef struct {
     __typeof__(br_mpc_variance) *variance;
     __typeof__(br_mpc_evaluate) *evaluate;
     br_mpc_error (*load)(br_gp *gp, const br_mpc_gp outputs[BR_NE]);
+#if BR_HAS_PATH
+    void (*limit)(br_mpc *mpc, int buffer);
+#endif
 } br_code;
 
 extern const br_code br_code_baseline;
@@ -339,6 +357,9 @@ BR_PART void br_stages_variances(const br_gp *gp, int stages, double (*x)[BR_NX]
 /* gp NULL: without correction. */
 BR_PART void br_stage_advance(const br_gp *gp, const double x[BR_NX], const double u[BR_NU],
                               double duration, double x_next[BR_NX]);
+/* One state by itself. */
+BR_PART void br_stage_linearise(const br_gp *gp, const double x[BR_NX], const double u[BR_NU],
+                                br_stage *stage);
 BR_PART __typeof__(br_mpc_predict) br_predict;
 BR_PART __typeof__(br_mpc_propagate) br_propagate;
 BR_PART __typeof__(br_mpc_variance) br_variance;
@@ -359,10 +380,19 @@ BR_PART void br_path_plan(const br_path *path, double pace, br_mpc_reference ref
 BR_PART void br_path_project(br_path *path, const double x[BR_NX], double *lateral);
 #if BR_FOLLOWS_PLAN
 BR_PART void br_path_follow(br_mpc *mpc);
+/* Whether the weights in use know the line's speeds for a horizon ahead of the car. */
+BR_PART int br_path_known_ahead(const br_path *path);
 #else
 static inline void br_path_follow(br_mpc *mpc) { (void)mpc; }
 #endif
 BR_PART void br_turnaround(br_mpc *mpc);
+BR_PART double br_path_curvature(const br_path *path, double s);
+/* Speed of the reference at this pace, where the car is, as a share of the line's. */
+BR_PART double br_path_pace(const br_path *path, double pace);
+
+/* --- br_certainty.c: the line's speeds as far as the weights know --- */
+
+BR_PART void br_limit_speeds(br_mpc *mpc, int buffer);
 #if BR_HAS_PATH
 BR_PART __typeof__(br_mpc_steer) br_steer;
 #endif

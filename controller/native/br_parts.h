@@ -10,6 +10,7 @@
 #pragma GCC diagnostic ignored "-Wunused-function" /* part of it is for other files */
 
 #include "br_caution.c"
+#include "br_certainty.c"
 #include "br_condense.c"
 #include "br_gp.c"
 #include "br_planner.c"

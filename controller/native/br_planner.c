@@ -19,8 +19,6 @@ typedef struct {
     double speed_mps; /* of the line */
 } place;
 
-enum { X = 0, Y = 1, SPEED = 2, NORMAL_X = 3, NORMAL_Y = 4, LOWER = 5, UPPER = 6 };
-
 br_mpc_error br_path_load(br_path *path, const double *table, int n, double spacing) {
     if (n < 8 || n > BR_PATH_CAPACITY) return BR_ERROR_PATH;
     if (!(spacing >= BR_PATH_SPACING_MIN_M && spacing <= BR_PATH_SPACING_MAX_M))
@@ -28,12 +26,15 @@ br_mpc_error br_path_load(br_path *path, const double *table, int n, double spac
     if (!br_all_finite(table, n * BR_PATH_COLUMNS)) return BR_ERROR_PATH;
     for (int i = 0; i < n; ++i) {
         const double *row = &table[i * BR_PATH_COLUMNS];
-        const double norm = hypot(row[NORMAL_X], row[NORMAL_Y]);
+        const double norm = hypot(row[BR_LINE_NORMAL_X], row[BR_LINE_NORMAL_Y]);
         const double *next = &table[(i + 1) % n * BR_PATH_COLUMNS];
-        if (fabs(row[X]) > BR_PATH_FAR_M || fabs(row[Y]) > BR_PATH_FAR_M) return BR_ERROR_PATH;
-        if (row[SPEED] <= 0 || row[SPEED] > BR_PATH_SPEED_MAX_MPS) return BR_ERROR_PATH;
-        if (row[UPPER] <= row[LOWER] || fabs(norm - 1) > 1e-6) return BR_ERROR_PATH;
-        if (next[X] == row[X] && next[Y] == row[Y]) return BR_ERROR_PATH; /* no direction there */
+        if (fabs(row[BR_LINE_X]) > BR_PATH_FAR_M || fabs(row[BR_LINE_Y]) > BR_PATH_FAR_M)
+            return BR_ERROR_PATH;
+        if (row[BR_LINE_SPEED] <= 0 || row[BR_LINE_SPEED] > BR_PATH_SPEED_MAX_MPS)
+            return BR_ERROR_PATH;
+        if (row[BR_LINE_UPPER] <= row[BR_LINE_LOWER] || fabs(norm - 1) > 1e-6) return BR_ERROR_PATH;
+        if (next[BR_LINE_X] == row[BR_LINE_X] && next[BR_LINE_Y] == row[BR_LINE_Y])
+            return BR_ERROR_PATH; /* no direction there */
     }
     memcpy(path->table, table, (size_t)n * sizeof path->table[0]);
     path->n = n;
@@ -65,13 +66,13 @@ static void path_at(const br_path *path, double s, double row[BR_PATH_COLUMNS]) 
 }
 
 static double squared_distance(const double *row, const double x[BR_NX]) {
-    const double dx = row[X] - x[BR_INDEX_X], dy = row[Y] - x[BR_INDEX_Y];
+    const double dx = row[BR_LINE_X] - x[BR_INDEX_X], dy = row[BR_LINE_Y] - x[BR_INDEX_Y];
     return dx * dx + dy * dy;
 }
 
 static int same_direction(const br_path *path, int i, double psi) {
     const double *a = path->table[i], *b = path->table[wrap_index(i + 1, path->n)];
-    return (b[X] - a[X]) * cos(psi) + (b[Y] - a[Y]) * sin(psi) > 0;
+    return (b[BR_LINE_X] - a[BR_LINE_X]) * cos(psi) + (b[BR_LINE_Y] - a[BR_LINE_Y]) * sin(psi) > 0;
 }
 
 /* Nearest row anywhere; one that leads another way than the car points counts as a track's width
@@ -82,7 +83,8 @@ static int nearest_anywhere(const br_path *path, const double x[BR_NX]) {
     for (int i = 0; i < path->n; ++i) {
         const double *row = path->table[i];
         double distance = sqrt(squared_distance(row, x));
-        if (!same_direction(path, i, x[BR_INDEX_PSI])) distance += row[UPPER] - row[LOWER];
+        if (!same_direction(path, i, x[BR_INDEX_PSI]))
+            distance += row[BR_LINE_UPPER] - row[BR_LINE_LOWER];
         if (distance < best_distance) {
             best = i;
             best_distance = distance;
@@ -114,8 +116,8 @@ static void project(const br_path *path, int i, const double x[BR_NX], double *s
     for (int k = -1; k <= 0; ++k) {
         const int j = wrap_index(i + k, path->n);
         const double *a = path->table[j], *b = path->table[wrap_index(j + 1, path->n)];
-        const double tx = b[X] - a[X], ty = b[Y] - a[Y];
-        const double px = x[BR_INDEX_X] - a[X], py = x[BR_INDEX_Y] - a[Y];
+        const double tx = b[BR_LINE_X] - a[BR_LINE_X], ty = b[BR_LINE_Y] - a[BR_LINE_Y];
+        const double px = x[BR_INDEX_X] - a[BR_LINE_X], py = x[BR_INDEX_Y] - a[BR_LINE_Y];
         double w = (px * tx + py * ty) / (tx * tx + ty * ty);
         w = w < 0 ? 0 : (w > 1 ? 1 : w);
         const double ex = px - w * tx, ey = py - w * ty, d2 = ex * ex + ey * ey;
@@ -131,8 +133,8 @@ static void project(const br_path *path, int i, const double x[BR_NX], double *s
 static void path_ahead(const br_path *path, double distance, double point[2]) {
     double row[BR_PATH_COLUMNS];
     path_at(path, path->s + distance, row);
-    point[0] = row[X];
-    point[1] = row[Y];
+    point[0] = row[BR_LINE_X];
+    point[1] = row[BR_LINE_Y];
 }
 
 /* Direction of the line, by a chord. */
@@ -140,11 +142,11 @@ static double path_heading(const br_path *path, double s) {
     double a[BR_PATH_COLUMNS], b[BR_PATH_COLUMNS];
     path_at(path, s - BR_BRAKING_CHORD_M / 2, a);
     path_at(path, s + BR_BRAKING_CHORD_M / 2, b);
-    return atan2(b[Y] - a[Y], b[X] - a[X]);
+    return atan2(b[BR_LINE_Y] - a[BR_LINE_Y], b[BR_LINE_X] - a[BR_LINE_X]);
 }
 
 /* Its curvature, by two of them. */
-static double path_curvature(const br_path *path, double s) {
+double br_path_curvature(const br_path *path, double s) {
     const double h = BR_BRAKING_CHORD_M / 2;
     const double turned = path_heading(path, s + h) - path_heading(path, s - h);
     return remainder(turned, 2 * M_PI) / (2 * h);
@@ -156,15 +158,18 @@ static void path_beside(const br_path *path, const double x[BR_NX], double *s_m,
     const int nearest = *s_m < 0 ? nearest_anywhere(path, x) : nearest_near(path, *s_m, x);
     project(path, nearest, x, s_m, &beside->left_m);
     path_at(path, *s_m, row);
-    const double norm = hypot(row[NORMAL_X], row[NORMAL_Y]);
+    const double norm = hypot(row[BR_LINE_NORMAL_X], row[BR_LINE_NORMAL_Y]);
     const double heading = path_heading(path, *s_m);
-    const double leftwards = row[NORMAL_Y] * cos(heading) - row[NORMAL_X] * sin(heading);
-    const double line = row[NORMAL_X] * row[X] + row[NORMAL_Y] * row[Y];
-    const double car = row[NORMAL_X] * x[BR_INDEX_X] + row[NORMAL_Y] * x[BR_INDEX_Y];
-    const double middle = (row[LOWER] + row[UPPER]) / 2 - line;
+    const double leftwards =
+        row[BR_LINE_NORMAL_Y] * cos(heading) - row[BR_LINE_NORMAL_X] * sin(heading);
+    const double line =
+        row[BR_LINE_NORMAL_X] * row[BR_LINE_X] + row[BR_LINE_NORMAL_Y] * row[BR_LINE_Y];
+    const double car =
+        row[BR_LINE_NORMAL_X] * x[BR_INDEX_X] + row[BR_LINE_NORMAL_Y] * x[BR_INDEX_Y];
+    const double middle = (row[BR_LINE_LOWER] + row[BR_LINE_UPPER]) / 2 - line;
     beside->middle_m = copysign(1, leftwards) * middle / norm;
-    beside->outside_m = fmax(row[LOWER] - car, car - row[UPPER]) / norm;
-    beside->speed_mps = row[SPEED];
+    beside->outside_m = fmax(row[BR_LINE_LOWER] - car, car - row[BR_LINE_UPPER]) / norm;
+    beside->speed_mps = row[BR_LINE_SPEED];
 }
 
 /* Where the car is on the line: path->s, and its distance to the left. */
@@ -176,32 +181,67 @@ void br_path_project(br_path *path, const double x[BR_NX], double *lateral) {
     project(path, path->known ? nearest_near(path, path->s, x) : nearest_anywhere(path, x), x, &s,
             lateral);
     path_at(path, s, row);
-    if (path->known && fabs(*lateral) > row[UPPER] - row[LOWER]) /* lost: off by a track's width */
+    if (path->known &&
+        fabs(*lateral) > row[BR_LINE_UPPER] - row[BR_LINE_LOWER]) /* lost: off by a track's width */
         project(path, nearest_anywhere(path, x), x, &s, lateral);
     path->s = s;
     path->known = 1;
 }
 
 static br_mpc_reference stage_at(const double row[BR_PATH_COLUMNS]) {
-    const double norm = hypot(row[NORMAL_X], row[NORMAL_Y]);
+    const double norm = hypot(row[BR_LINE_NORMAL_X], row[BR_LINE_NORMAL_Y]);
     return (br_mpc_reference){
-        .x = row[X],
-        .y = row[Y],
-        .normal_x = row[NORMAL_X] / norm,
-        .normal_y = row[NORMAL_Y] / norm,
-        .lower = row[LOWER] / norm,
-        .upper = row[UPPER] / norm,
+        .x = row[BR_LINE_X],
+        .y = row[BR_LINE_Y],
+        .normal_x = row[BR_LINE_NORMAL_X] / norm,
+        .normal_y = row[BR_LINE_NORMAL_Y] / norm,
+        .lower = row[BR_LINE_LOWER] / norm,
+        .upper = row[BR_LINE_UPPER] / norm,
     };
 }
+
+/* What of the line's speed at arc length s the weights in use know, interpolated as in path_at. */
+static double known_speed(const br_path *path, double s) {
+    const double position = wrap_length(s, path->length) / path->spacing;
+    const double *speed = path->speed[path->buffer];
+    int i = (int)position;
+    if (i >= path->n) i = path->n - 1;
+    return speed[i] + (position - i) * (speed[wrap_index(i + 1, path->n)] - speed[i]);
+}
+
+/* The same at this pace, but no slower than a car that knows nothing. */
+static double reference_speed(const br_path *path, double pace, double s) {
+    double row[BR_PATH_COLUMNS];
+    path_at(path, s, row);
+    return fmax(pace * known_speed(path, s), fmin(pace, BR_CAUTION_LEAST) * row[BR_LINE_SPEED]);
+}
+
+double br_path_pace(const br_path *path, double pace) {
+    double row[BR_PATH_COLUMNS];
+    if (!path->ready) return pace;
+    path_at(path, path->s, row);
+    return fmin(reference_speed(path, pace, path->s) / row[BR_LINE_SPEED], 1);
+}
+
+#if BR_FOLLOWS_PLAN
+int br_path_known_ahead(const br_path *path) {
+    double s = path->s, row[BR_PATH_COLUMNS];
+    for (int k = 0; k < BR_N; ++k) {
+        path_at(path, s, row);
+        if (known_speed(path, s) < row[BR_LINE_SPEED]) return 0;
+        s += BR_TS * row[BR_LINE_SPEED];
+    }
+    return 1;
+}
+#endif
 
 /* Points to track: the recursion in the line's speed, of which pace is a share, from the car's
  * projection on. */
 void br_path_plan(const br_path *path, double pace, br_mpc_reference reference[BR_N]) {
     double s = path->s, row[BR_PATH_COLUMNS];
     for (int k = 0; k < BR_N; ++k) {
-        path_at(path, s, row);
         const double limit = path->speed_limit - k * BR_TS * path->speed_limit_rate;
-        s += BR_TS * fmax(fmin(pace * row[SPEED], limit), 0);
+        s += BR_TS * fmax(fmin(reference_speed(path, pace, s), limit), 0);
         path_at(path, s, row);
         reference[k] = stage_at(row);
     }
@@ -230,10 +270,12 @@ static double direction_at(const br_path *path, double s, double tangent[2]) {
     path_at(path, s - h, a);
     path_at(path, s, b);
     path_at(path, s + h, c);
-    const double dx = c[X] - a[X], dy = c[Y] - a[Y], length = hypot(dx, dy);
+    const double dx = c[BR_LINE_X] - a[BR_LINE_X], dy = c[BR_LINE_Y] - a[BR_LINE_Y],
+                 length = hypot(dx, dy);
     tangent[0] = dx / length;
     tangent[1] = dy / length;
-    const double ddx = c[X] - 2 * b[X] + a[X], ddy = c[Y] - 2 * b[Y] + a[Y];
+    const double ddx = c[BR_LINE_X] - 2 * b[BR_LINE_X] + a[BR_LINE_X],
+                 ddy = c[BR_LINE_Y] - 2 * b[BR_LINE_Y] + a[BR_LINE_Y];
     return (tangent[0] * ddy - tangent[1] * ddx) / (h * h);
 }
 
@@ -258,7 +300,7 @@ void br_path_follow(br_mpc *mpc) {
         br_mpc_reference *stage = &mpc->reference[k];
         *stage = stage_at(row);
         stage->follows = 1;
-        const double pace = 1 / (fmax(1 - curvature * lateral, 0.2) * row[SPEED]);
+        const double pace = 1 / (fmax(1 - curvature * lateral, 0.2) * row[BR_LINE_SPEED]);
         stage->pace_x = pace * tangent[0];
         stage->pace_y = pace * tangent[1];
     }
@@ -291,8 +333,8 @@ br_mpc_error br_steer(const br_mpc *mpc, const double x[BR_NX], double *s_m, dou
     const double heading = path_heading(&mpc->path, *s_m);
     const double course = x[BR_INDEX_PSI] + atan2(vy, fmax(vx, BR_BRAKING_SLOW_MPS)) - heading;
     const double back = 2 * sin(remainder(-sideways - course, 2 * M_PI)) / reach;
-    const double kappa = path_curvature(&mpc->path, *s_m + vx * BR_BRAKING_PREVIEW_S) + back;
-    const double excess = x[BR_INDEX_OMEGA] - vx * path_curvature(&mpc->path, *s_m);
+    const double kappa = br_path_curvature(&mpc->path, *s_m + vx * BR_BRAKING_PREVIEW_S) + back;
+    const double excess = x[BR_INDEX_OMEGA] - vx * br_path_curvature(&mpc->path, *s_m);
     const double angle = atan(BR_WHEELBASE_M * kappa) +
                          BR_BRAKING_UNDERSTEER_S2PM * kappa * vx * vx -
                          BR_BRAKING_DAMPING_S * excess;

@@ -96,6 +96,15 @@ void br_stages_variances(const br_gp *gp, int stages, double (*x)[BR_NX], double
     br_gp_variances(gp, stages, z, work, variance);
 }
 
+void br_stage_linearise(const br_gp *gp, const double x[BR_NX], const double u[BR_NU],
+                        br_stage *stage) {
+    BR_ALIGNED br_gp_row kernels[BR_NE * BR_GP_BLOCKS];
+    double state[1][BR_NX], input[1][BR_NU];
+    memcpy(state, x, sizeof state);
+    memcpy(input, u, sizeof input);
+    stages_linearise(gp, 1, state, input, kernels, 1, 0, stage);
+}
+
 /* sum_j (F_e' lambda)_j d^2 mu_j / d z^2 of all stages, by slot. */
 static void residual_curvature(const br_gp *gp, int stages, double (*x)[BR_NX], double (*u)[BR_NU],
                                double (*lambda)[BR_NX], br_gp_row *kernels, const br_stage *stage,

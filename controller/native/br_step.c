@@ -264,7 +264,8 @@ static int take_environment(br_mpc *mpc, const br_environment *environment) {
  * turn need them, and a slow car, which a turn may begin with. */
 static void plan_reference(br_mpc *mpc) {
 #if BR_FOLLOWS_PLAN
-    const int follows = !isfinite(mpc->path.speed_limit) && mpc->caution.pace >= 1;
+    const int follows = !isfinite(mpc->path.speed_limit) && mpc->caution.pace >= 1 &&
+                        br_path_known_ahead(&mpc->path);
     const int before = mpc->follows;
     mpc->follows = follows;
     if (follows && before && fabs(mpc->x0[BR_INDEX_VX]) >= BR_TURN_SLOW_MPS) return;
@@ -451,4 +452,7 @@ const br_code BR_CODE = {.step = br_step,
 #endif
                          .variance = br_variance,
                          .evaluate = br_evaluate,
+#if BR_HAS_PATH
+                         .limit = br_limit_speeds,
+#endif
                          .load = br_gp_load};

@@ -35,6 +35,9 @@ _END_S: Final = 5.0
 _POLL_S: Final = 0.02
 """Between two looks at what is waited for: the control thread wakes no other thread."""
 
+_NOTED_S: Final = 0.01
+"""Of a lap: less is not worth a word."""
+
 _MOST_WAITING: Final = 32
 """Requests; each may hold a file."""
 _FILE_BYTES: Final = 200_000
@@ -163,7 +166,14 @@ class WeightUpdateManager:
         self._counts["accepted"] += 1
         in_use = f"in use from cycle {cycle} on, as number {new.number}"
         text = f"weights {new.version} {in_use}; {verdict['text']}"
-        facts = {"number": new.number, "cycle": cycle, "adoption_us": self.adoption.us}
+        unknown_s = self._port.step.unknown_s
+        if unknown_s >= _NOTED_S:
+            where = "where the line is faster than what they have learned"
+            text += f"; {unknown_s:.2f} s a lap are lost {where}: train on a track with such bends"
+        facts = {
+            "number": new.number, "cycle": cycle, "adoption_us": self.adoption.us,
+            "unknown_s": unknown_s,
+        }  # fmt: skip
         facts = verdict["data"] | facts | request.by
         self._announce("weights_accepted", text, facts)
         return self._kept(text, facts)
