@@ -2,9 +2,9 @@
 
 A racing line touches the edges of the track, and a driver that is disturbed on purpose, and slides,
 leaves it there. So the drive follows the racing line where that leaves room to the edges, and else
-a line made of it. A drive that leaves the track or spins is driven again, slower where it did, and
-so is one in which the fallback has to brake often, because the car was lost sight of. Elsewhere it
-stays as fast: a residual is known at the speeds only that were driven.
+a line made of it. A drive that leaves the track or spins is driven again, slower where it did;
+elsewhere it stays as fast, as a residual is known at the speeds only that were driven. One in which
+the fallback has to brake often, because the car was lost sight of, is slower everywhere.
 """
 
 from dataclasses import replace
@@ -13,7 +13,7 @@ from typing import Final
 
 import numpy as np
 
-from bayesrace.arrays import Flags, Floats
+from bayesrace.arrays import Floats
 from bayesrace.controller.pure_pursuit import DrivingStyle, PurePursuit, PurePursuitSettings
 from bayesrace.controller.python_controller import PythonController
 from bayesrace.log import LogWriter
@@ -34,10 +34,15 @@ __all__ = [
 _ATTEMPTS: Final = 10
 _SLOWER: Final = 0.85
 """Speed over that of the attempt before, where something went wrong ..."""
-_BEFORE_S: Final = 0.8
-"""... and for so long before; within as much time before that it falls."""
+_BEFORE: Final = 7.0
+"""... and before, for as long a way as so many times what the driver looks ahead; within as much
+again the speed falls, and within ..."""
+_AFTER: Final = 0.25
+"""... this share of it, after the place, it rises again."""
 _FALLBACK: Final = 0.1
-"""Share of the cycles that the fallback may drive."""
+"""Share of the cycles that the fallback may drive; with more the car is too fast to be seen, ..."""
+_SEEN: Final = 0.93
+"""... and is slower everywhere."""
 _MOST: Final = 0.3
 """Of a track's width: the most that the line keeps from each edge."""
 _LAPS: Final = 1.5
@@ -98,28 +103,25 @@ def collect(
             raise FmuFault(driven.end.text)
         wrong = track.project_path(driven.x[:, :2]).off_track_m > 0
         wrong |= np.abs(driven.slip_rad) > car.tuning.gate.spin_rad
-        if not wrong.any():
-            if driven.fallbacks <= _FALLBACK * len(driven.levels):
-                break
-            wrong[: len(driven.levels)] = driven.levels > 0
-        speeds = speeds * slower_before(followed, driven, wrong)
+        unseen = driven.fallbacks > _FALLBACK * len(driven.levels)
+        if not wrong.any() and not unseen:
+            break
+        speeds = (_SEEN if unseen else 1.0) * speeds
+        if wrong.any():  # the first time: what comes after it may follow of it
+            speeds = speeds * slower_before(followed, driven.x[int(np.argmax(wrong))], car)
     return driven
 
 
-def slower_before(line: RaceLine, driven: Driven, wrong: Flags) -> Floats:
-    """Shares of the line's speeds, (n,), by which a drive is to be slower where it led to samples
-    that are ``wrong`` (m,), one for each of its states."""
-    share: Floats = np.ones(len(line.s_m))
-    place = [int(np.argmin(np.sum((line.xy_m - at) ** 2, axis=1))) for at in driven.x[:, :2]]
-    for begin in np.flatnonzero(wrong & ~np.roll(wrong, 1)):
-        ahead_s = driven.time_s[begin] - driven.time_s[: begin + 1]
-        by = (1 - _SLOWER) * np.clip(2 - ahead_s / _BEFORE_S, 0, 1)
-        for k in np.flatnonzero(by):
-            passed = np.arange(1 + (place[min(k + 1, begin)] - place[k]) % len(share))
-            if len(passed) < len(share) / 2:  # else the car was driven backwards
-                rows = (place[k] + passed) % len(share)
-                share[rows] = np.minimum(share[rows], 1 - by[k])
-    return share
+def slower_before(line: RaceLine, x: Floats, car: CarParameters) -> Floats:
+    """Shares of the line's speeds, (n,), by which the car is to be slower before the state ``x``
+    (7,)."""
+    begin = int(np.argmin(np.sum((line.xy_m - x[:2]) ** 2, axis=1)))
+    way_m = _BEFORE * car.tuning.pursuit.preview_s * max(float(x[3]), float(line.vx_mps.min()))
+    way_m = min(way_m, line.length_m / (2 + _AFTER))
+    before_m = (line.s_m[begin] - line.s_m) % line.length_m
+    rising = np.clip(1 - (line.length_m - before_m) / (_AFTER * way_m), 0, 1)
+    falling = np.clip(2 - before_m / way_m, 0, 1)
+    return np.asarray(1 - (1 - _SLOWER) * np.maximum(falling, rising))
 
 
 def pursuit_controller(

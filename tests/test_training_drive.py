@@ -109,22 +109,17 @@ def test_a_drive_in_which_the_car_is_lost_sight_of_is_driven_again_slower(
     assert 0.85 < float(about["speed_scale"]) / pure_pursuit._SCALES["limit"] < 1
 
 
-def test_a_drive_is_slower_only_where_something_went_wrong(
-    driven: dict[DrivingStyle, tuple[Driven, Path]],
-) -> None:
-    """Before the place, less and less the earlier it was; across the line's first point, too."""
-    one, _ = driven["calm"]
-    line = training_line(TRACK, at_the_edge(), CAR, "calm")
-    nearest = [int(np.argmin(np.hypot(*(line.xy_m - at).T))) for at in one.x[:, :2]]
-    begin = next(k for k in range(300, 600) if nearest[k] < nearest[k - 1])
-    wrong = np.zeros(len(one.x), dtype=bool)
-    wrong[begin : begin + 20] = True
-    share = slower_before(line, one, wrong)
-    assert share[nearest[begin]] == share[nearest[begin - 30]] == pytest.approx(0.85)
-    assert share[nearest[begin - 60]] == pytest.approx(0.925, abs=0.01)
-    assert share[nearest[begin - 90]] == share[nearest[begin + 5]] == 1
-    steps = np.abs(np.diff(np.append(share, share[0])))
-    assert np.sort(steps)[:-1].max() < 0.02, "it begins at the place, and nowhere else at once"
+def test_a_drive_is_slower_only_where_something_went_wrong() -> None:
+    """Before the place, less the earlier it was, and a little after; across the line's first point,
+    too, and without a step."""
+    line, x = training_line(TRACK, at_the_edge(), CAR, "calm"), np.zeros(7)
+    x[:2], x[3] = line.xy_m[5], 2.0
+    share = slower_before(line, x, CAR)
+    way = round(7 * CAR.tuning.pursuit.preview_s * 2.0 / line.length_m * len(share))
+    assert share[5] == share[5 - way // 2] == pytest.approx(0.85)
+    assert share[5 - way - way // 2] == pytest.approx(0.925, abs=0.01)
+    assert share[5 - 2 * way - 2] == share[5 + way // 4 + 2] == 1
+    assert np.abs(np.diff(np.append(share, share[0]))).max() < 0.03
 
 
 def test_a_drive_of_estimated_states_lasts_twice_as_long() -> None:

@@ -33,10 +33,10 @@ enum {
 
 static const int sought[FREE] = {BR_INDEX_VY, BR_INDEX_DELTA, BR_NX + BR_INDEX_DUTY};
 static const int going[FREE] = {BR_INDEX_VX, BR_INDEX_VY, BR_INDEX_OMEGA};
-/* Errors of a stage [m/s, m/s, rad/s], and distances from the guess [m/s, rad, command], that weigh
- * the same; and the longest step of a round. */
-static const double error_size[FREE] = {0.002, 0.002, 0.02}, guess_size[FREE] = {0.5, 0.2, 1.0};
-static const double longest[FREE] = {0.1, 0.05, 0.5};
+/* As shares of the deviations that caution weighs equally: errors of a stage and distances from the
+ * guess that weigh the same, and the longest step of a round. */
+static const double error_share = 0.002, guess_share[FREE] = {0.5, 0.2, 1.0};
+static const double longest_share[FREE] = {0.1, 0.05, 0.5};
 
 /* A place of the line, and the car's state [x; u] there, of which position and heading do not
  * matter. */
@@ -69,14 +69,17 @@ static void improve_state(const br_mpc *mpc, const br_gp *gp, place_on_line *at,
     const br_mpc_parameters *p = &mpc->parameters;
     const br_stage *stage = &at->stage;
     const double wanted[FREE] = {gained, 0, gained * at->curvature};
+    const double unit[FREE] = {BR_STATE_DEVIATION[BR_INDEX_VY], BR_STATE_DEVIATION[BR_INDEX_DELTA],
+                               BR_INPUT_EFFORT[BR_INDEX_DUTY]};
     double m[FREE][FREE] = {{0}}, b[FREE], row[FREE];
     br_stage_linearise(gp, at->v, at->v + BR_NX, &at->stage);
     for (int a = 0; a < FREE; ++a) {
-        m[a][a] = 1 / (guess_size[a] * guess_size[a]);
+        const double size = guess_share[a] * unit[a];
+        m[a][a] = 1 / (size * size);
         b[a] = -m[a][a] * (at->v[sought[a]] - guess[a]);
     }
     for (int i = 0; i < FREE; ++i) {
-        const double size = error_size[i];
+        const double size = error_share * BR_STATE_DEVIATION[going[i]];
         const double error = (stage->f[going[i]] - at->v[going[i]] - wanted[i]) / size;
         for (int a = 0; a < FREE; ++a)
             row[a] = (stage->jacobian[going[i]][sought[a]] - (sought[a] == going[i])) / size;
@@ -89,7 +92,8 @@ static void improve_state(const br_mpc *mpc, const br_gp *gp, place_on_line *at,
     const double most[FREE] = {at->v[BR_INDEX_VX], p->delta_max_rad, p->d_max};
     const double least[FREE] = {-at->v[BR_INDEX_VX], -p->delta_max_rad, p->d_min};
     for (int a = 0; a < FREE; ++a) {
-        const double step = fmin(fmax(b[a], -longest[a]), longest[a]);
+        const double longest = longest_share[a] * unit[a];
+        const double step = fmin(fmax(b[a], -longest), longest);
         at->v[sought[a]] = fmin(fmax(at->v[sought[a]] + step, least[a]), most[a]);
     }
 }
