@@ -111,11 +111,13 @@ def test_where_going_back_is_no_better_the_car_slows_down_and_says_so(
     tmp_path: Path, course: Course, good: GpWeights
 ) -> None:
     """At speed, no correction, as at the start, is worse than one that errs in vx alone."""
-    start, gate = tmp_path / "none.bin", tmp_path / "gate.json"
+    start, gate, mpc = (tmp_path / name for name in ("none.bin", "gate.json", "mpc.json"))
     write_weights(start, zero_weights("orca", good.discretisation))
     gate.write_text('{"watch_least": 60}')
+    mpc.write_text('{"caution": 0}')  # it would be slow from the start
     at_start = replace(course, weights_file=start)
-    with rigged(tmp_path, at_start, "--gate", str(gate)) as rig:
+    options = "--gate", str(gate), "--settings", str(mpc)
+    with rigged(tmp_path, at_start, *options) as rig:
         rig.send(spoilt(good, "flip vx"))
         rig.drive(1)
         (slowed,) = rig.events("weights_slowed")
