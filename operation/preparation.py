@@ -205,7 +205,7 @@ def _training_drive(
     files = [path for path in (settings.fmu, settings.fmu_map) if path is not None]
     others = [] if settings.simulator == "equations" else [settings.simulator]
     track, line = prepared.track, prepared.line
-    duration_s = settings.collect_s or drive_length_s(car, line, settings.instruments)
+    duration_s = _drive_s(settings, car, line)
     path = _place(
         "drive-{}.mcap", ("mcap", *others),
         track.identity,
@@ -230,6 +230,11 @@ def _training_drive(
     return Training(prepared, path, kept(path, make, read))
 
 
+def _drive_s(settings: PreparationSettings, car: CarParameters, line: RaceLine) -> float:
+    """Length of the training drive."""
+    return settings.collect_s or drive_length_s(car, line, settings.instruments)
+
+
 def drive_for_training(
     settings: PreparationSettings,
     track: Track,
@@ -244,7 +249,7 @@ def drive_for_training(
     Raises InputError for an FMU or map that cannot be used, FmuFault if the FMU fails.
     """
     pursuit = settings.pursuit.model_copy(update={"seed": settings.seed})
-    duration_s = settings.collect_s or drive_length_s(car, line, settings.instruments)
+    duration_s = _drive_s(settings, car, line)
     simulated_by = settings.true_car, settings.fmu, settings.fmu_map, 1 / PLANT.step_s, compiled
     with open_vehicle(*simulated_by, simulator=settings.simulator) as vehicle:
         return collect(

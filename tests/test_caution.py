@@ -17,11 +17,11 @@ from bayesrace.controller.settings import MpcSettings
 from bayesrace.gp.weights import KERNELS, GpWeights, read_weights
 from bayesrace.integrators import PREDICTION
 from bayesrace.learning.validation import predictive_sigma
-from bayesrace.operation.closed_loop import ClosedLoop
+from bayesrace.operation.closed_loop import ClosedLoop, built_in_car
 from bayesrace.operation.preparation import prepare
 from bayesrace.operation.settings import RaceSettings
 from bayesrace.operation.terminal.terminal import stages_on
-from bayesrace.vehicles import CarParameters
+from bayesrace.vehicles import CarParameters, default_car
 from bayesrace.vehicles.models import dynamic, e_kinematic
 from bayesrace.vehicles.tuning import CautionTuning
 from tests.conftest import CAUTIOUS, Circuit, Make, discrete, fit_weights, smooth_drive
@@ -161,7 +161,7 @@ def test_the_reference_does_not_leap_when_nothing_is_uncertain_any_more(
     make: Make, car: CarParameters, weights: GpWeights, circuit: Circuit
 ) -> None:
     """As after a rollback to no weights."""
-    step = make(noisy(weights, 100), caution=0.95)
+    step = make(noisy(weights, 20), caution=0.95)
     x, u, paces = driven(step, car, circuit.start(), np.zeros(2), 40)
     assert step.step(np.full(7, np.nan), u) is StepStatus.BAD_STATE
     assert step.info.pace == paces[-1]  # also that of a step that plans nothing
@@ -169,7 +169,7 @@ def test_the_reference_does_not_leap_when_nothing_is_uncertain_any_more(
     assert step.step(x, u).usable
     assert paces[-1] < 0.9
     faster = 1 + car.tuning.caution.faster_ps * PREDICTION.step_s
-    assert paces[-1] <= step.info.pace <= faster * paces[-1] * (1 + 1e-9)
+    assert step.info.pace == pytest.approx(faster * paces[-1])
 
 
 @pytest.mark.parametrize(("side", "bound"), [(1, 5), (-1, 4)])
@@ -232,9 +232,16 @@ def test_shares_in_the_tuning_are_shares(car: CarParameters, change: dict[str, f
         CautionTuning.model_validate(stated)
 
 
-def test_first_laps_faster_than_all_training_stay_on_the_track() -> None:
-    """The car was driven at half of the line's speed: the plan leaves what was driven."""
-    settings = RaceSettings(track="harbour", pursuit=PurePursuitSettings(speed_scale=0.5))
+@pytest.mark.check
+def test_first_laps_on_slippery_tyres_stay_on_the_track() -> None:
+    """The tyres give 18 % less than the racing line asks for: the plan leaves what was driven.
+
+    The samples' mirror images alone would keep this car on this track, and so would a training
+    drive that had found its limit.
+    """
+    one_sided = default_car().model_copy(update={"mirrored_samples": False})
+    calm = PurePursuitSettings(speed_scale=0.6)
+    settings = RaceSettings(track="harbour", true_grip=0.82, car=one_sided, pursuit=calm)
     with stages_on(Console(quiet=True)) as stages:
         files = prepare(settings, (settings.track,), stages)
     weights = read_weights(files.weights)
@@ -242,6 +249,7 @@ def test_first_laps_faster_than_all_training_stay_on_the_track() -> None:
     for mpc in (MpcSettings(caution=0.0), MpcSettings()):
         on, line, car = files.first.track, files.first.line, settings.car
         controller = compiled_controller(files.artefacts[0], car, on, line, weights, mpc)
-        deepest.append(float(ClosedLoop(car, on, line, controller).drive(2).off_track_m.max()))
+        loop = ClosedLoop(car, on, line, controller, built_in_car(settings.true_car))
+        deepest.append(float(loop.drive(2).off_track_m.max()))
     assert deepest[0] > 0.05
     assert deepest[1] <= 0

@@ -193,9 +193,10 @@ void br_caution_tighten(br_mpc *mpc, int k, br_stage_terms *terms) {
 }
 
 void br_caution_report(br_mpc *mpc) {
-    mpc->info.pace = mpc->caution.pace;
 #if BR_HAS_PATH
     mpc->info.pace = br_path_pace(&mpc->path, mpc->caution.pace);
+#else
+    mpc->info.pace = mpc->caution.pace;
 #endif
     mpc->info.widening = mpc->caution.widening;
 }

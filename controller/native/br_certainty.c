@@ -185,7 +185,7 @@ static double line_acceleration(const br_path *path, int from, int rows) {
     return (next * next - v * v) / (2 * rows * path->spacing);
 }
 
-/* The largest acceleration of the line: the car's grip, as it was known to whoever made it. */
+/* The largest acceleration along the line, which stands for the car's grip. */
 static double grip_of(const br_path *path) {
     double grip = 0;
     for (int i = 0; i < path->n; ++i) {

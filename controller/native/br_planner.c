@@ -55,12 +55,19 @@ static double wrap_length(double s, double length) {
     return s < 0 ? s + length : s;
 }
 
-/* Row of the table at arc length s, interpolated. */
-static void path_at(const br_path *path, double s, double row[BR_PATH_COLUMNS]) {
+/* The row of the table before arc length s, and how far s is on the way to the next one. */
+static int row_before(const br_path *path, double s, double *share) {
     const double position = wrap_length(s, path->length) / path->spacing;
     int i = (int)position;
     if (i >= path->n) i = path->n - 1;
-    const double w = position - i;
+    *share = position - i;
+    return i;
+}
+
+/* Row of the table at arc length s, interpolated. */
+static void path_at(const br_path *path, double s, double row[BR_PATH_COLUMNS]) {
+    double w;
+    const int i = row_before(path, s, &w);
     const double *a = path->table[i], *b = path->table[wrap_index(i + 1, path->n)];
     for (int c = 0; c < BR_PATH_COLUMNS; ++c) row[c] = a[c] + w * (b[c] - a[c]);
 }
@@ -200,13 +207,12 @@ static br_mpc_reference stage_at(const double row[BR_PATH_COLUMNS]) {
     };
 }
 
-/* What of the line's speed at arc length s the weights in use know, interpolated as in path_at. */
+/* What of the line's speed at arc length s the weights in use know. */
 static double known_speed(const br_path *path, double s) {
-    const double position = wrap_length(s, path->length) / path->spacing;
     const double *speed = path->speed[path->buffer];
-    int i = (int)position;
-    if (i >= path->n) i = path->n - 1;
-    return speed[i] + (position - i) * (speed[wrap_index(i + 1, path->n)] - speed[i]);
+    double w;
+    const int i = row_before(path, s, &w);
+    return speed[i] + w * (speed[wrap_index(i + 1, path->n)] - speed[i]);
 }
 
 /* The same at this pace, but no slower than a car that knows nothing. */

@@ -118,7 +118,8 @@ def test_where_going_back_is_no_better_the_car_slows_down_and_says_so(
     at_start = replace(course, weights_file=start)
     options = "--gate", str(gate), "--settings", str(mpc)
     with rigged(tmp_path, at_start, *options) as rig:
-        rig.send(spoilt(good, "flip vx"))
+        sent = rig.send(spoilt(good, "flip vx"))
+        assert sent["unknown_s"] == 0, "nothing is asked for without caution"
         rig.drive(1)
         (slowed,) = rig.events("weights_slowed")
         assert "predicted vx worse, and the proven ones" in slowed.text
@@ -133,6 +134,15 @@ def test_where_going_back_is_no_better_the_car_slows_down_and_says_so(
         assert rig.counters()["weights_slowed"] is True
         rig.send(good)
         assert rig.counters()["weights_slowed"] is False
+
+
+def test_the_event_says_what_a_lap_loses_where_weights_do_not_know_the_car(
+    rig: Rig, good: GpWeights
+) -> None:
+    lost_s = rig.send(spoilt(good, "flip vx"))["unknown_s"]
+    assert lost_s > 0.1
+    rig.drive(1)
+    assert f"{lost_s:.2f} s a lap are lost" in rig.events("weights_accepted")[-1].text
 
 
 QUICK = ("flip all", "swap vy omega")
