@@ -3,8 +3,9 @@
 A racing line touches the edges of the track, and a driver that is disturbed on purpose, and slides,
 leaves it there. So the drive follows the racing line where that leaves room to the edges, and else
 a line made of it. A drive that leaves the track or spins is driven again, slower where it did;
-elsewhere it stays as fast, as a residual is known at the speeds only that were driven. One in which
-the fallback has to brake often, because the car was lost sight of, is slower everywhere.
+elsewhere it stays as fast, as a residual is known at the speeds only that were driven. Where that
+does not help, the line is too fast everywhere, and so it is if the fallback has to brake often,
+because the car was lost sight of.
 """
 
 from dataclasses import replace
@@ -39,10 +40,10 @@ _BEFORE: Final = 7.0
 again the speed falls, and within ..."""
 _AFTER: Final = 0.25
 """... this share of it, after the place, it rises again."""
+_EVERYWHERE: Final = 0.93
+"""The same, where the car has to be slower everywhere."""
 _FALLBACK: Final = 0.1
-"""Share of the cycles that the fallback may drive; with more the car is too fast to be seen, ..."""
-_SEEN: Final = 0.93
-"""... and is slower everywhere."""
+"""Share of the cycles that the fallback may drive; with more the car is too fast to be seen."""
 _MOST: Final = 0.3
 """Of a track's width: the most that the line keeps from each edge."""
 _LAPS: Final = 1.5
@@ -82,7 +83,7 @@ def collect(
     """
     followed = training_line(track, line, car, settings.style)
     room_m, vehicle = room_beside(track, followed), vehicle or built_in_car(car)
-    speeds = followed.vx_mps
+    speeds, slowed = followed.vx_mps, np.ones(len(followed.vx_mps))
     for attempt in range(1 if settings.speed_scale else _ATTEMPTS):
         pursuit = PurePursuit(car, followed.x_m, followed.y_m, speeds, settings, room_m=room_m)
         scale = settings.scale * float(np.mean(speeds / followed.vx_mps))
@@ -103,12 +104,16 @@ def collect(
             raise FmuFault(driven.end.text)
         wrong = track.project_path(driven.x[:, :2]).off_track_m > 0
         wrong |= np.abs(driven.slip_rad) > car.tuning.gate.spin_rad
-        unseen = driven.fallbacks > _FALLBACK * len(driven.levels)
-        if not wrong.any() and not unseen:
+        everywhere = driven.fallbacks > _FALLBACK * len(driven.levels)
+        if not wrong.any() and not everywhere:
             break
-        speeds = (_SEEN if unseen else 1.0) * speeds
+        slower = np.ones(len(speeds))
         if wrong.any():  # the first time: what comes after it may follow of it
-            speeds = speeds * slower_before(followed, driven.x[int(np.argmax(wrong))], car)
+            slower = slower_before(followed, driven.x[int(np.argmax(wrong))], car)
+            if slowed[int(np.argmin(slower))] < 1:
+                everywhere, slower = True, np.ones(len(speeds))
+        slowed = slower * slowed
+        speeds = (_EVERYWHERE if everywhere else 1.0) * slower * speeds
     return driven
 
 
