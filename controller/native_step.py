@@ -324,7 +324,7 @@ class NativeProblem:
     ) -> None:
         """What the car did between two measured states (nx,), under u (nu,) on average.
 
-        Where such errors are larger than the posterior's standard deviations, caution widens these.
+        With caution, what the corrected model errs by is estimated, and corrected from then on.
         ``noise`` (2, nx), where the states are estimates: the variances in br_mpc_noise.
         InputError for a duration that is not above 0 and at most 1, or numbers that are not finite.
         """

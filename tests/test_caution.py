@@ -97,14 +97,17 @@ def output_effect(car: CarParameters, v: Floats, mean: Floats) -> Floats:
 
 
 def tube_of(step: NativeStep, car: CarParameters, weights: GpWeights, plan: Floats) -> Floats:
-    """The tube of a plan v = [x; u] (N, 9) by NumPy, along the normals of the last reference."""
+    """The tube of a plan v = [x; u] (N, 9) by NumPy, along the normals of the last reference.
+
+    What the residual's mean may err by counts, and noise, which averages out, does not."""
     problem = tracking(e_kinematic(car), PREDICTION)
     q = np.diag([1 / one.deviation**2 for one in problem.states])
     r = np.diag([1 / one.effort**2 for one in problem.inputs])
     jacobians = [step.evaluate(v, np.zeros(7))[1] for v in plan]
     nominal = PREDICTION.discretise(e_kinematic(car))
     at = np.arange(7) * (len(plan) - 1) // 6  # the others are interpolated
-    known = predictive_sigma(weights, plan[at, 3:])
+    noise = np.array([one.y_scale**2 * one.noise_variance for one in weights.outputs])
+    known = np.sqrt(predictive_sigma(weights, plan[at, 3:]) ** 2 - noise)
     stages = np.arange(len(plan))
     sigma = np.column_stack([np.interp(stages, at, column) for column in known.T])
     gains = []
@@ -161,7 +164,7 @@ def test_the_reference_does_not_leap_when_nothing_is_uncertain_any_more(
     make: Make, car: CarParameters, weights: GpWeights, circuit: Circuit
 ) -> None:
     """As after a rollback to no weights."""
-    step = make(noisy(weights, 20), caution=0.95)
+    step = make(noisy(weights, 100), caution=0.95)
     x, u, paces = driven(step, car, circuit.start(), np.zeros(2), 40)
     assert step.step(np.full(7, np.nan), u) is StepStatus.BAD_STATE
     assert step.info.pace == paces[-1]  # also that of a step that plans nothing
@@ -174,10 +177,10 @@ def test_the_reference_does_not_leap_when_nothing_is_uncertain_any_more(
 
 @pytest.mark.parametrize(("side", "bound"), [(1, 5), (-1, 4)])
 def test_the_plan_keeps_its_uncertainty_away_from_the_edge(
-    make: Make, car: CarParameters, circuit: Circuit, side: int, bound: int
+    make: Make, car: CarParameters, weights: GpWeights, circuit: Circuit, side: int, bound: int
 ) -> None:
     """Of a track that ends 1 cm beside the line, on either side."""
-    step = make(caution=0.95)
+    step = make(noisy(weights, 10), caution=0.95)
     x, u, _ = driven(step, car, circuit.start(), np.zeros(2), 25)
     line = step.read_reference()
     along = np.sum(line[:, 2:4] * line[:, :2], axis=1)

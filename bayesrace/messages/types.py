@@ -260,8 +260,8 @@ class Telemetry(Message, frozen=True, kw_only=True, tag=6):
     """Speed of the reference as a share of the racing line's; below 1 where the model is too
     uncertain about the plan."""
     widening: Annotated[float, Meta(ge=0.0, le=1e6)]
-    """Factor by which the model's standard deviations have been widened because its one-step errors
-    exceeded them; 1 where they cover these."""
+    """Factor on the model's standard deviations by what is not known of its mismatch, which is
+    estimated from its one-step errors; the largest along the plan, 1 where nothing is lacking."""
     residual_dynamics: Measure
     """Largest dynamics defect of the plan; -1: unknown or not finite (as below)."""
     residual_bounds: Measure

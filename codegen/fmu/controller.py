@@ -55,7 +55,7 @@ _SOLVER: Final = (
 
 _PLANNED: Final = (
     ("pace", "1", "of the reference, as a share of the line's speed"),
-    ("widening", "1", "of the model's band by the errors observed; 1: it covers them"),
+    ("widening", "1", "of the model's band by what is not known of its mismatch; 1: nothing"),
     ("s_ref_m", "m", "arc length of the car on the racing line"),
     ("lateral_m", "m", "distance from the racing line, positive to the left"),
 )

@@ -27,7 +27,6 @@ from bayesrace.codegen.problems.problem import (
 from bayesrace.integrators import Discretisation
 from bayesrace.vehicles.models import STATES, Model, top_command
 from bayesrace.vehicles.parameters import CarParameters
-from bayesrace.vehicles.tuning import Tuning
 
 __all__ = ["REFERENCE", "StateCost", "advance_function", "driving_problem", "linearise_function"]
 
@@ -58,6 +57,7 @@ def _inputs(car: CarParameters, proximal: tuple[float, float]) -> tuple[Input, .
             limit=1e3,
             proximal=proximal[1],
             effort=effort.steering_rate_radps,
+            odd=car.mirrored_samples,
         ),
     )
 
@@ -80,17 +80,18 @@ def _parameters(car: CarParameters) -> tuple[Parameter, ...]:
     )
 
 
-def _states(tuning: Tuning) -> tuple[State, ...]:
+def _states(car: CarParameters) -> tuple[State, ...]:
     """With the sizes by which defects are measured, and the largest plausible values."""
-    size, most, off = tuning.scale, tuning.plausible, tuning.caution
+    size, most, off = car.tuning.scale, car.tuning.plausible, car.tuning.caution
+    odd = car.mirrored_samples
     return (
         State("x", "m", size.position_m, most.position_m, off.position_m),
-        State("y", "m", size.position_m, most.position_m, off.position_m),
-        State("psi", "rad", size.heading_rad, most.heading_rad, off.heading_rad),
+        State("y", "m", size.position_m, most.position_m, off.position_m, odd),
+        State("psi", "rad", size.heading_rad, most.heading_rad, off.heading_rad, odd),
         State("vx", "m/s", size.speed_mps, most.speed_mps, off.speed_mps),
-        State("vy", "m/s", size.speed_mps, most.speed_mps, off.speed_mps),
-        State("omega", "rad/s", size.yaw_rate_radps, most.yaw_rate_radps, off.yaw_rate_radps),
-        State("delta", "rad", size.steering_rad, most.steering_rad, off.steering_rad),
+        State("vy", "m/s", size.speed_mps, most.speed_mps, off.speed_mps, odd),
+        State("omega", "rad/s", size.yaw_rate_radps, most.yaw_rate_radps, off.yaw_rate_radps, odd),
+        State("delta", "rad", size.steering_rad, most.steering_rad, off.steering_rad, odd),
     )
 
 
@@ -204,7 +205,7 @@ def driving_problem(
     reached = ca.vertcat(s.x[:6], ca.fmin(ca.fmax(delta, -delta_max), delta_max))
     return Problem(
         name=name,
-        states=_states(car.tuning),
+        states=_states(car),
         inputs=inputs,
         stage_parameters=stage,
         parameters=parameters,

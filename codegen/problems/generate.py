@@ -223,6 +223,8 @@ def c_header(problem: Problem) -> str:
         _array("BR_INPUT_PROXIMAL", [float(one.proximal) for one in inputs], "double"),
         _array("BR_STATE_DEVIATION", [float(one.deviation) for one in states], "double"),
         _array("BR_INPUT_EFFORT", [float(one.effort) for one in inputs], "double"),
+        _array("BR_STATE_ODD", [one.odd for one in states]),
+        _array("BR_INPUT_ODD", [one.odd for one in inputs]),
         _array("BR_INPUT_HELD", [one.held for one in inputs]),
         _array("BR_PARAMETER_LOW", [float(one.low) for one in problem.parameters], "double"),
         _array("BR_PARAMETER_HIGH", [float(one.high) for one in problem.parameters], "double"),

@@ -39,6 +39,8 @@ class State:
     deviation: float = 1.0
     """What feedback about a plan weighs as much as a deviation of another component, or an
     :attr:`Input.effort`."""
+    odd: bool = False
+    """It changes its sign in a mirror, in which the system moves as before; the others stay."""
 
 
 @dataclass(frozen=True)
@@ -53,6 +55,8 @@ class Input:
     """A larger absolute value is no input of this system."""
     effort: float = 1.0
     """What feedback about a plan weighs as much as a :attr:`State.deviation`."""
+    odd: bool = False
+    """As :attr:`State.odd`."""
     proximal: float = 0.0
     """Weight of half the squared change of this input in one QP. Not part of the cost: the plan
     that the iterations converge to is the same. For a cost that is linear in much of the plan."""

@@ -67,7 +67,7 @@ br_mpc_error br_mpc_init(void *memory, size_t size, br_mpc **out) {
     atomic_init(&mpc->spare, BR_SPARE_FREE);
     mpc->gp_spare = 1;
     br_caution_reset(&mpc->caution);
-    br_innovation_reset(&mpc->innovation);
+    br_mismatch_reset(&mpc->mismatch);
     mpc->code = codes[supported()];
     *out = mpc;
     return BR_OK;
@@ -90,7 +90,7 @@ br_mpc_error br_mpc_set_parameters(br_mpc *mpc, const br_mpc_parameters *paramet
     mpc->parameters = *parameters;
     mpc->has_parameters = 1;
     br_invalidate(mpc, BR_TUBE);
-    br_innovation_undo(&mpc->innovation);
+    br_mismatch_undo(&mpc->mismatch);
     br_evaluate_penalties(mpc);
     mpc->caution.wanted = 0;
     for (int r = 0; r < BR_NR && parameters->caution_sigmas > 0; ++r)
@@ -125,8 +125,7 @@ void br_mpc_reset(br_mpc *mpc) {
     mpc->ahead = mpc->prepared = mpc->prepared_iterations = 0;
     mpc->path.known = 0;
     br_caution_reset(&mpc->caution);
-    mpc->innovation.newest.duration = 0;
-    br_innovation_reset(&mpc->innovation);
+    br_mismatch_reset(&mpc->mismatch);
     mpc->turn = 0;
     mpc->attempts = mpc->starts = mpc->futile = mpc->looks = 0;
 }
@@ -139,7 +138,7 @@ br_mpc_error br_mpc_observe(br_mpc *mpc, const double x[BR_NX], const double u[B
     if (!br_plausible_state(x) || !br_plausible_state(x_next) ||
         !br_plausible(u, BR_INPUT_LIMIT, BR_NU))
         return BR_ERROR_STATE;
-    br_transition *newest = &mpc->innovation.newest;
+    br_transition *newest = &mpc->mismatch.newest;
     newest->duration = duration_s;
     memcpy(newest->x, x, sizeof newest->x);
     memcpy(newest->u, u, sizeof newest->u);
@@ -286,7 +285,7 @@ static void use(br_mpc *mpc, int buffer) {
     mpc->watch.since = mpc->watch.count;
     memset(mpc->watch.judged, 0, sizeof mpc->watch.judged);
     br_forget_linearisation(mpc);
-    br_innovation_reset(&mpc->innovation);
+    br_mismatch_reset(&mpc->mismatch);
 }
 
 /* The caller has taken the spare buffer and is the control thread. Weights that were in use without

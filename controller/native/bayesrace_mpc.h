@@ -129,8 +129,8 @@ typedef struct {
                               * largest */
     double pace;             /* of the reference, as a share of the line's speed; 1 where all is
                               * known */
-    double widening;         /* of the residual's standard deviations by the errors observed; 1:
-                              * they cover these */
+    double widening;         /* of the residual's standard deviations by what is not known of its
+                              * mismatch, the largest along the plan; 1: nothing is lacking */
     double s_ref_m;          /* projection of the car on the racing line */
     double lateral_m;        /* distance of the car from the racing line, positive left */
 } br_mpc_info;
@@ -285,13 +285,12 @@ BR_API br_mpc_error br_mpc_solve(br_mpc *mpc, const double x[BR_NX], const doubl
                                  br_mpc_status *status, br_mpc_info *info);
 
 /* Compares what the car did between two measured states, under the mean of the inputs that acted
- * meanwhile, with the prediction. Where the residual's standard deviations do not cover the errors,
- * caution widens them from the step after the next on (info->widening), until br_mpc_reset or other
- * weights. For consecutive states of a car that moves, about a stage apart, by the thread that
- * steps; the newest before a step counts. Never needed; without caution it changes nothing.
- * noise: as an estimator has it; NULL: the states are exact.
- * BR_ERROR_TIME for a duration that is not above 0 and at most BR_PREDICT_MAX_S, BR_ERROR_STATE as
- * for br_mpc_predict.
+ * meanwhile, with the prediction. What this errs by is estimated: from the step after the next on
+ * the model is corrected by it, and caution counts what is not known of it (info->widening), until
+ * br_mpc_reset or other weights. For consecutive states of a car that moves, about a stage apart,
+ * by the thread that steps; the newest before a step counts. Never needed; without caution it
+ * changes nothing. noise: as an estimator has it; NULL: the states are exact. BR_ERROR_TIME for a
+ * duration that is not above 0 and at most BR_PREDICT_MAX_S, BR_ERROR_STATE as for br_mpc_predict.
  */
 BR_API br_mpc_error br_mpc_observe(br_mpc *mpc, const double x[BR_NX], const double u[BR_NU],
                                    double duration_s, const double x_next[BR_NX],
@@ -312,10 +311,10 @@ BR_API br_mpc_error br_mpc_set_covariance(br_mpc *mpc, const double covariance[B
  * Does nothing if there is no plan. */
 BR_API br_mpc_error br_mpc_prepare(br_mpc *mpc, double elapsed_s, double budget_s);
 
-/* Where the corrected model takes x within duration_s (0 to BR_PREDICT_MAX_S) under input u, both
- * held to their limits as the car does: whole stages by the map that the controller predicts with,
- * the rest by the same scheme with the shorter step and that share of the residual. x_next may be
- * x. Changes nothing in mpc. BR_ERROR_STATE: x_next is not written. */
+/* Where the corrected model with its mismatch takes x within duration_s (0 to BR_PREDICT_MAX_S)
+ * under input u, both held to their limits as the car does: whole stages by the map that the
+ * controller predicts with, the rest by the same scheme with the shorter step and that share of the
+ * residual. x_next may be x. Changes nothing in mpc. BR_ERROR_STATE: x_next is not written. */
 BR_API br_mpc_error br_mpc_predict(const br_mpc *mpc, const double x[BR_NX], const double u[BR_NU],
                                    double duration_s, double x_next[BR_NX]);
 

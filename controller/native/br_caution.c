@@ -12,8 +12,9 @@
  * row h <= upper becomes h + n |D_k' grad h| <= upper with n standard deviations. (Independent
  * errors would add up to the root of the number of stages only, which is far too little:
  * docs/decisions/2026-11-23-caution.md has the laps.) K is the gain of a linear quadratic regulator
- * about the plan; the problem names the sizes of the deviations that it weighs equally. Where the
- * car errs more than sigma says, sigma is widened: see below.
+ * about the plan; the problem names the sizes of the deviations that it weighs equally. sigma
+ * counts what the mean may err by, without noise, which averages out, and with what is not known of
+ * the mismatch (br_mismatch.c).
  *
  * As in zero-order robust MPC (Zanelli, Frey, Messerer, Diehl, "Zero-order robust nonlinear model
  * predictive control with ellipsoidal uncertainty sets", 2021) all of this belongs to the plan that
@@ -21,7 +22,7 @@
  */
 #include "br_internal.h"
 
-#define WIDE 4.0 /* widening from which on the reference recovers more slowly */
+#define WIDEST 1e6 /* what is reported at most */
 
 /* Weight of a deviation or effort of this size as 1. */
 static double weight_of(double size) { return 1.0 / (size * size); }
@@ -87,8 +88,8 @@ static void propagate(const br_stage *stage, double gain[BR_NU][BR_NX], int outp
 static void standard_deviations(br_mpc *mpc, double sigma[BR_N][BR_NE]) {
     enum { COUNT = BR_N < BR_COLUMNS ? BR_N : BR_COLUMNS - 1 };
     double x[COUNT + 1][BR_NX], u[COUNT + 1][BR_NU], variance[COUNT + 1][BR_NE];
-    const br_transition *due = &mpc->innovation.due;
-    const int observed = br_innovation_due(&mpc->innovation);
+    const br_transition *due = &mpc->mismatch.due;
+    const int observed = br_mismatch_due(&mpc->mismatch);
     int stage[COUNT];
     for (int i = 0; i < COUNT; ++i) {
         stage[i] = COUNT > 1 ? i * (BR_N - 1) / (COUNT - 1) : 0;
@@ -97,13 +98,18 @@ static void standard_deviations(br_mpc *mpc, double sigma[BR_N][BR_NE]) {
     }
     memcpy(x[COUNT], due->x, sizeof x[COUNT]);
     memcpy(u[COUNT], due->u, sizeof u[COUNT]);
-    br_stages_variances(&mpc->gp[mpc->gp_in_use], COUNT + observed, x, u, mpc->caution.correlations,
-                        variance);
-    if (observed) br_innovation_judge(mpc, variance[COUNT]);
-    for (int j = 0; j < BR_NE; ++j) {
-        const double widening = br_innovation_widening(&mpc->innovation, j);
-        for (int i = 0; i < COUNT; ++i) sigma[stage[i]][j] = widening * sqrt(variance[i][j]);
-    }
+    const br_gp *gp = &mpc->gp[mpc->gp_in_use];
+    br_stages_variances(gp, COUNT + observed, x, u, mpc->caution.correlations, variance);
+    if (observed) br_mismatch_judge(mpc, variance[COUNT]);
+    double ratio = 0;
+    for (int j = 0; j < BR_NE; ++j)
+        for (int i = 0; i < COUNT; ++i) {
+            const double latent = br_worse(0, variance[i][j] - gp->variance[j].noise);
+            const double mismatch = br_mismatch_variance(mpc, stage[i], j);
+            sigma[stage[i]][j] = sqrt(latent + mismatch);
+            if (variance[i][j] > 0) ratio = fmax(ratio, mismatch / variance[i][j]);
+        }
+    mpc->caution.widening = fmin(sqrt(1 + ratio), WIDEST);
     for (int i = 1; i < COUNT; ++i)
         for (int k = stage[i - 1] + 1; k < stage[i]; ++k) {
             const double share = (k - stage[i - 1]) / (double)(stage[i] - stage[i - 1]);
@@ -145,7 +151,11 @@ void br_caution_update(br_mpc *mpc) {
     caution->active = mpc->parameters.caution_sigmas > 0 && gp->uncertain;
     if (was || caution->active) br_invalidate(mpc, BR_TERMS);
     mpc->timer.caution = 0;
-    if (!caution->active) return;
+    caution->widening = 1;
+    if (!caution->active) {
+        mpc->mismatch.any = 0;
+        return;
+    }
     const double begin = br_timer_now(&mpc->timer);
     double sigma[BR_N][BR_NE], gain[BR_N][BR_NU][BR_NX];
     standard_deviations(mpc, sigma);
@@ -201,14 +211,6 @@ void br_caution_report(br_mpc *mpc) {
     mpc->info.widening = mpc->caution.widening;
 }
 
-/* The largest factor on an output's standard deviations. */
-static double largest_widening(const br_mpc *mpc) {
-    double largest = 1;
-    for (int j = 0; j < BR_NE && mpc->caution.active; ++j)
-        largest = fmax(largest, br_innovation_widening(&mpc->innovation, j));
-    return largest;
-}
-
 /* After a step: the speed of the next reference as a share of the line's. It falls where
  * uncertainty takes more than BR_CAUTION_SHARE of the room at a stage, or is not finite, by at most
  * BR_CAUTION_SLOWER per second, and rises elsewhere by at most BR_CAUTION_FASTER, also when nothing
@@ -218,7 +220,6 @@ static double largest_widening(const br_mpc *mpc) {
 void br_caution_pace(br_mpc *mpc, double elapsed) {
     br_caution *caution = &mpc->caution;
     double worst = 0;
-    caution->widening = largest_widening(mpc);
     mpc->info.tube_m = 0;
     for (int k = 0; k < BR_N; ++k) {
         worst = br_worse(worst, caution->share[k]);
@@ -227,8 +228,7 @@ void br_caution_pace(br_mpc *mpc, double elapsed) {
     memcpy(mpc->answer_tube, caution->tube, sizeof mpc->answer_tube);
 #if BR_HAS_PATH
     const double excess = worst / BR_CAUTION_SHARE - 1;
-    const double faster = BR_CAUTION_FASTER / fmax(caution->widening / WIDE, 1);
-    const double rate = excess <= 0 ? faster * fmin(-2 * excess, 1)
+    const double rate = excess <= 0 ? BR_CAUTION_FASTER * fmin(-2 * excess, 1)
                                     : -BR_CAUTION_SLOWER * fmin(excess, 1); /* NaN, too */
     const double pace = caution->pace * (1 + rate * fmin(elapsed, BR_TS));
     caution->pace = fmin(fmax(pace, BR_CAUTION_LEAST), 1);

@@ -40,6 +40,8 @@ typedef struct {
     double uu[2 * BR_NU][2 * BR_NU];                         /* of [u; u_before] */
 } br_stage_curvature;
 
+enum { BR_NM = 1 + BR_NZ + BR_NE }; /* terms of the mismatch: 1, features, what a stage changes */
+
 /* Linearisation of the corrected model at one stage. */
 typedef struct {
     double f[BR_NX];
@@ -47,7 +49,8 @@ typedef struct {
     double hessian[BR_NV][BR_NV]; /* weighted with the costate of the stage's end; made later */
     double in_e[BR_NX][BR_NE];    /* the nominal model's Jacobian in the residual */
     br_correction residual;
-    int slot; /* where the weights of its kernels are kept */
+    double terms[BR_NM]; /* of the mismatch, by the model without it */
+    int slot;            /* where the weights of its kernels are kept */
 } br_stage;
 
 typedef struct {
@@ -144,16 +147,32 @@ typedef struct {
     br_judged judged[BR_WATCHED]; /* the newest */
 } br_watch;
 
-/* Of each output, by how many standard deviations the residual errs: see br_watch.c. */
+/* The model's mismatch, by what the car has done lately: see br_mismatch.c. */
+/* What the errors of the corrected model say of one output, older ones less. */
 typedef struct {
-    double recent[BR_NE], held[BR_NE]; /* mean of the newest; the largest, slowly forgotten */
-} br_misfit;
+    double information[BR_NM][BR_NM], projection[BR_NM]; /* sums of terms terms' / r, terms y / r */
+    double squares, precision, count;                    /* sums of y y / r, 1 / r, 1 */
+    double excess;   /* mean square of what the weights leave, over r */
+    double surprise; /* of the newest errors, over that */
+    double prior;    /* variance of a weight before anything has been seen */
+} br_evidence;
+
+/* What follows of that: y = weight' terms, and how sure that is. */
+typedef struct {
+    double weight[BR_NM];
+    double factor[BR_NM][BR_NM]; /* Cholesky factor of the weights' inverse covariance, with the
+                                    reciprocals of its diagonal */
+    double unexplained;          /* variance of y beside r */
+} br_regression;
 
 typedef struct {
     br_transition newest, due; /* due: observed before the last step */
-    int judged;                /* what is due is in misfit, else in neither */
-    br_misfit misfit, before;
-} br_innovation;
+    int judged;                /* what is due is in evidence, else in neither */
+    br_evidence evidence[BR_NE], before[BR_NE];
+    br_regression found[BR_NE]; /* of the evidence; in use from the next step on: */
+    double weight[BR_NE][BR_NM];
+    int any; /* weights are in use that are not 0 */
+} br_mismatch;
 
 /* What the residual's uncertainty does to the plan: see br_caution.c. */
 typedef struct {
@@ -268,7 +287,8 @@ struct br_mpc {
     double answer_tube[BR_N];                                /* how uncertain it is */
     br_timer timer;
     br_caution caution;
-    br_innovation innovation;
+    int changed[BR_NE]; /* the state that each output of the residual changes most */
+    br_mismatch mismatch;
     br_watch watch;
     br_stage stage[BR_N];
     BR_ALIGNED br_gp_row kernels[BR_NE * BR_GP_BLOCKS * BR_N]; /* see br_gp_evaluate */
@@ -397,18 +417,32 @@ BR_PART void br_limit_speeds(br_mpc *mpc, int buffer);
 BR_PART __typeof__(br_mpc_steer) br_steer;
 #endif
 
-/* --- br_watch.c: predictions against what the car does --- */
+/* --- br_mismatch.c: what the corrected model errs by lately --- */
 
-BR_PART void br_innovation_reset(br_innovation *innovation);
+/* Into mpc->changed, by the linearisation of stage 0. */
+BR_PART void br_find_changed(br_mpc *mpc);
+BR_PART void br_mismatch_reset(br_mismatch *mismatch);
 /* A step has been made: what was observed before it is due. */
-BR_PART void br_innovation_advance(br_innovation *innovation);
-/* By what the standard deviations of the output are to be multiplied. */
-BR_PART double br_innovation_widening(const br_innovation *innovation, int output);
-BR_PART int br_innovation_due(const br_innovation *innovation);
+BR_PART void br_mismatch_advance(br_mismatch *mismatch);
+BR_PART int br_mismatch_due(const br_mismatch *mismatch);
 /* As if what is due had not been judged: parameters or code are others now. */
-BR_PART void br_innovation_undo(br_innovation *innovation);
+BR_PART void br_mismatch_undo(br_mismatch *mismatch);
 /* What is due, by the variance of the residual there; the plan is linearised. */
-BR_PART void br_innovation_judge(br_mpc *mpc, const double variance[BR_NE]);
+BR_PART void br_mismatch_judge(br_mpc *mpc, const double variance[BR_NE]);
+/* Variance of what is not known of the mismatch at a stage of the plan. */
+BR_PART double br_mismatch_variance(const br_mpc *mpc, int stage, int output);
+/* w' phi of each output at x and u, which lead to `end` by the corrected model. */
+BR_PART void br_mismatch_mean(const br_mpc *mpc, const double x[BR_NX], const double u[BR_NU],
+                              const double end[BR_NX], double duration, double error[BR_NE]);
+/* To a stage that is linearised without it, to first order in it. */
+BR_PART void br_mismatch_add(const br_mpc *mpc, const double x[BR_NX], const double u[BR_NU],
+                             br_stage *stage);
+/* With what this adds to lambda, lambda' F has the second derivatives of lambda' (F + F_e w' phi):
+ * phi is linear in [x; u] and F. */
+BR_PART void br_mismatch_price(const br_mpc *mpc, const br_stage *stage, double lambda[BR_NX]);
+
+/* --- br_watch.c: what the car does against predictions --- */
+
 BR_PART void br_watch_update(br_mpc *mpc); /* in the preparation */
 
 /* --- br_caution.c: the tube --- */

@@ -13,6 +13,7 @@
 #include "br_certainty.c"
 #include "br_condense.c"
 #include "br_gp.c"
+#include "br_mismatch.c"
 #include "br_planner.c"
 #include "br_problem.c"
 #include "br_qp.c"

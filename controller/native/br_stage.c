@@ -138,23 +138,34 @@ static BR_APART void stages_curve(const br_gp *gp, int stages, double (*x)[BR_NX
     }
 }
 
-static void stage_next(const br_gp *gp, const double x[BR_NX], const double u[BR_NU],
-                       double x_next[BR_NX]) {
-    double z[BR_NZ], mean[BR_NE] = {0};
-    br_stage_features(x, u, z);
-    if (gp && gp->any) br_gp_mean(gp, z, mean);
-    nominal(x, u, mean, x_next, NULL);
+/* The same scheme over a duration; of part of a stage, with a shorter step. */
+static void nominal_over(const double x[BR_NX], const double u[BR_NU], const double e[BR_NE],
+                         double duration, double x_next[BR_NX]) {
+    if (duration == BR_TS)
+        nominal(x, u, e, x_next, NULL);
+    else
+        BR_CALL(br_advance, BR_LIST(x, u, e, &duration), BR_LIST(x_next));
 }
 
-/* Over part of a stage: the same scheme with the shorter step. The residual was learned per stage;
- * to first order that part of it has come about. */
-void br_stage_advance(const br_gp *gp, const double x[BR_NX], const double u[BR_NU],
-                      double duration, double x_next[BR_NX]) {
-    double z[BR_NZ], mean[BR_NE] = {0};
+/* The residual was learned per stage; to first order a part of it has come about in a part of it.
+ */
+static void stage_advance(const br_gp *gp, const br_mpc *mismatched, const double x[BR_NX],
+                          const double u[BR_NU], double duration, double x_next[BR_NX]) {
+    double z[BR_NZ], mean[BR_NE] = {0}, error[BR_NE];
+    const double share = duration / BR_TS;
     br_stage_features(x, u, z);
     if (gp && gp->any) br_gp_mean(gp, z, mean);
-    for (int j = 0; j < BR_NE; ++j) mean[j] *= duration / BR_TS;
-    BR_CALL(br_advance, BR_LIST(x, u, mean, &duration), BR_LIST(x_next));
+    for (int j = 0; j < BR_NE; ++j) mean[j] *= share;
+    nominal_over(x, u, mean, duration, x_next);
+    if (!mismatched) return;
+    br_mismatch_mean(mismatched, x, u, x_next, duration, error);
+    for (int j = 0; j < BR_NE; ++j) mean[j] += share * error[j];
+    nominal_over(x, u, mean, duration, x_next);
+}
+
+void br_stage_advance(const br_gp *gp, const double x[BR_NX], const double u[BR_NU],
+                      double duration, double x_next[BR_NX]) {
+    stage_advance(gp, NULL, x, u, duration, x_next);
 }
 
 /* --- the plan --- */
@@ -165,6 +176,9 @@ void br_linearise_stages(br_mpc *mpc, int first, int stages, int slot) {
     mpc->valid[BR_LINEARISATION] = 1;
     stages_linearise(&mpc->gp[mpc->gp_in_use], stages, &mpc->plan.x[first], &mpc->plan.u[first],
                      mpc->kernels, BR_N, slot, &mpc->stage[first]);
+    br_find_changed(mpc);
+    for (int k = first; k < first + stages; ++k)
+        br_mismatch_add(mpc, mpc->plan.x[k], mpc->plan.u[k], &mpc->stage[k]);
 }
 
 void br_linearise_plan(br_mpc *mpc) { br_linearise_stages(mpc, 0, BR_N, 0); }
@@ -173,33 +187,28 @@ void br_linearise_plan(br_mpc *mpc) { br_linearise_stages(mpc, 0, BR_N, 0); }
 void br_curve_plan(br_mpc *mpc) {
     if (mpc->curved) return;
     mpc->curved = 1;
-    stages_curve(&mpc->gp[mpc->gp_in_use], BR_N, mpc->plan.x, mpc->plan.u, mpc->plan.costate + 1,
-                 mpc->kernels, mpc->stage);
+    double lambda[BR_N][BR_NX];
+    memcpy(lambda, mpc->plan.costate[1], sizeof lambda);
+    for (int k = 0; k < BR_N; ++k) br_mismatch_price(mpc, &mpc->stage[k], lambda[k]);
+    stages_curve(&mpc->gp[mpc->gp_in_use], BR_N, mpc->plan.x, mpc->plan.u, lambda, mpc->kernels,
+                 mpc->stage);
 }
 
 /* --- where the car will be: the corrected model over any duration --- */
 
 /* x <- the state after a duration of at most a stage. */
-static void advance(const br_mpc *mpc, const br_gp *gp, double x[BR_NX], const double u[BR_NU],
-                    double duration) {
+static void advance(const br_mpc *mpc, const br_gp *gp, int mismatch, double x[BR_NX],
+                    const double u[BR_NU], double duration) {
     const double *theta = br_theta(&mpc->parameters);
     double acting[BR_NU], unlimited[BR_NX];
     BR_CALL(br_acting, BR_LIST(x, u, &duration, theta), BR_LIST(acting));
-    if (duration == BR_TS) {
-        stage_next(gp, x, acting, unlimited);
-    } else {
-        br_stage_advance(gp, x, acting, duration, unlimited);
-    }
+    const br_mpc *mismatched = mismatch && mpc->mismatch.any ? mpc : NULL;
+    stage_advance(gp, mismatched, x, acting, duration, unlimited);
     BR_CALL(br_reached, BR_LIST(unlimited, theta), BR_LIST(x));
 }
 
-br_mpc_error br_predict(const br_mpc *mpc, const double x[BR_NX], const double u[BR_NU],
-                        double duration_s, double x_next[BR_NX]) {
-    return br_predict_by(mpc, &mpc->gp[mpc->gp_in_use], x, u, duration_s, x_next);
-}
-
-br_mpc_error br_predict_by(const br_mpc *mpc, const br_gp *gp, const double x[BR_NX],
-                           const double u[BR_NU], double duration_s, double x_next[BR_NX]) {
+static br_mpc_error predict(const br_mpc *mpc, const br_gp *gp, int mismatch, const double x[BR_NX],
+                            const double u[BR_NU], double duration_s, double x_next[BR_NX]) {
     if (!x || !u || !x_next) return BR_ERROR_NULL;
     if (!mpc->has_parameters) return BR_ERROR_NOT_READY;
     if (!(duration_s >= 0 && duration_s <= BR_PREDICT_MAX_S)) return BR_ERROR_TIME;
@@ -208,13 +217,23 @@ br_mpc_error br_predict_by(const br_mpc *mpc, const br_gp *gp, const double x[BR
     memcpy(state, x, sizeof state);
     double left = duration_s;
     for (; left >= BR_TS * (1 - PART_MIN); left -= BR_TS) {
-        advance(mpc, gp, state, u, BR_TS);
+        advance(mpc, gp, mismatch, state, u, BR_TS);
         if (!br_plausible_state(state)) return BR_ERROR_STATE;
     }
-    if (left > BR_TS * PART_MIN) advance(mpc, gp, state, u, left);
+    if (left > BR_TS * PART_MIN) advance(mpc, gp, mismatch, state, u, left);
     if (!br_plausible_state(state)) return BR_ERROR_STATE;
     memcpy(x_next, state, sizeof state);
     return BR_OK;
+}
+
+br_mpc_error br_predict(const br_mpc *mpc, const double x[BR_NX], const double u[BR_NU],
+                        double duration_s, double x_next[BR_NX]) {
+    return predict(mpc, &mpc->gp[mpc->gp_in_use], 1, x, u, duration_s, x_next);
+}
+
+br_mpc_error br_predict_by(const br_mpc *mpc, const br_gp *gp, const double x[BR_NX],
+                           const double u[BR_NU], double duration_s, double x_next[BR_NX]) {
+    return predict(mpc, gp, 0, x, u, duration_s, x_next);
 }
 
 /* The weights by which states are estimated: the proven ones, if they correct anything, also while
@@ -293,6 +312,8 @@ br_mpc_error br_evaluate(const br_mpc *mpc, const double v[BR_NV], const double 
     memcpy(costate, lambda, sizeof costate);
     br_stage stage;
     stages_linearise(gp, 1, x, u, kernels, 1, 0, &stage);
+    br_mismatch_add(mpc, x[0], u[0], &stage);
+    br_mismatch_price(mpc, &stage, costate[0]);
     stages_curve(gp, 1, x, u, costate, kernels, &stage);
     memcpy(x_next, stage.f, sizeof stage.f);
     memcpy(jacobian, stage.jacobian, sizeof stage.jacobian);

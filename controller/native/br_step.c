@@ -30,7 +30,7 @@ static void undo_preparation(br_mpc *mpc) {
         br_invalidate(mpc, BR_LINEARISATION);
     }
     mpc->ahead = mpc->looked = 0;
-    br_innovation_undo(&mpc->innovation);
+    br_mismatch_undo(&mpc->mismatch);
 }
 
 /* Of other weights or code; the preparation's new last stage was predicted with those before. */
@@ -213,7 +213,7 @@ static void solve(br_mpc *mpc, double u[BR_NU], br_mpc_status *status, br_mpc_in
     memcpy(mpc->answer_reference, mpc->reference, sizeof mpc->answer_reference);
     mpc->info.status = *status;
     br_invalidate(mpc, BR_TUBE); /* the next step starts with another plan */
-    br_innovation_advance(&mpc->innovation);
+    br_mismatch_advance(&mpc->mismatch);
     br_caution_advance(&mpc->caution);
     br_caution_pace(mpc, mpc->elapsed);
     if (info) *info = mpc->info;

@@ -185,7 +185,7 @@ def lap_figures(
     on the first; lateral acceleration, with what the ``friction`` of the line would allow, and slip
     on the flying one. Where there was caution, what the uncertainty of the model does on the first
     lap: how far off the plan's last stage may be, the speed that the reference is left with, and by
-    how much the errors that were seen have widened the model's band.
+    how much what is not known of the model's mismatch widens its band.
     """
     first, flying = first_laps(runs, track), _flying_laps(runs, track)
     by_s = np.argsort(s_m := track.project_points(line.xy_m).s_m)[:: max(1, len(line.s_m) // 800)]
