@@ -41,7 +41,7 @@ again the speed falls, and within ..."""
 _AFTER: Final = 0.25
 """... this share of it, after the place, it rises again."""
 _EVERYWHERE: Final = 0.93
-"""The same, where the car has to be slower everywhere."""
+"""Speed over that of the attempt before, where the car has to be slower everywhere."""
 _FALLBACK: Final = 0.1
 """Share of the cycles that the fallback may drive; with more the car is too fast to be seen."""
 _MOST: Final = 0.3
@@ -109,18 +109,24 @@ def collect(
             break
         slower = np.ones(len(speeds))
         if wrong.any():  # the first time: what comes after it may follow of it
-            slower = slower_before(followed, driven.x[int(np.argmax(wrong))], car)
-            if slowed[int(np.argmin(slower))] < 1:
+            at = driven.x[int(np.argmax(wrong))]
+            slower = slower_before(followed, at, car)
+            if slowed[_nearest(followed, at)] < 1:
                 everywhere, slower = True, np.ones(len(speeds))
         slowed = slower * slowed
         speeds = (_EVERYWHERE if everywhere else 1.0) * slower * speeds
     return driven
 
 
+def _nearest(line: RaceLine, x: Floats) -> int:
+    """The point of the line that is nearest to the state."""
+    return int(np.argmin(np.sum((line.xy_m - x[:2]) ** 2, axis=1)))
+
+
 def slower_before(line: RaceLine, x: Floats, car: CarParameters) -> Floats:
     """Shares of the line's speeds, (n,), by which the car is to be slower before the state ``x``
     (7,)."""
-    begin = int(np.argmin(np.sum((line.xy_m - x[:2]) ** 2, axis=1)))
+    begin = _nearest(line, x)
     way_m = _BEFORE * car.tuning.pursuit.preview_s * max(float(x[3]), float(line.vx_mps.min()))
     way_m = min(way_m, line.length_m / (2 + _AFTER))
     before_m = (line.s_m[begin] - line.s_m) % line.length_m

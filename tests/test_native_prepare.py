@@ -1,6 +1,7 @@
 """The preparation phase: saves the step time, and changes nothing else."""
 
 from collections.abc import Callable
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -39,16 +40,23 @@ def test_prepared_steps_are_the_same_to_the_bit(
         prepared.prepare()
 
 
+@pytest.mark.parametrize("caution", [0.0, 0.95])
 @pytest.mark.parametrize("expected", [0.0, 0.002, TS, 3 * TS, 0.39, 5.0])
 @pytest.mark.parametrize("elapsed", [0.0, 0.009, TS, 2 * TS, 5 * TS, 0.395, 1.0])
 def test_an_unexpected_time_is_corrected(
-    make: Make, recorded: list[Problem], expected: float, elapsed: float
+    make: Make, recorded: list[Problem], expected: float, elapsed: float, caution: float
 ) -> None:
-    prepared, plain = make(), make()
-    for p in recorded[:8]:
+    """Also by a controller that learns of what it is shown."""
+    prepared, plain = make(caution=caution), make(caution=caution)
+    for p, after in pairwise(recorded[:9]):
         assert solve(prepared, p) is solve(plain, p)
-    for p in recorded[8:11]:
+        for step in (prepared, plain):
+            step.observe(p.x0, plain.u, TS, after.x0)
+    for p, after in pairwise(recorded[8:12]):
+        for step in (prepared, plain):
+            step.observe(p.x0, plain.u, TS, after.x0)
         prepared.prepare(expected)
+        prepared.rehearse()
         assert solve(prepared, p, elapsed_s=elapsed) is solve(plain, p, elapsed_s=elapsed)
         assert result(prepared) == result(plain)
 

@@ -5,6 +5,7 @@ import json
 import shutil
 from dataclasses import replace
 from functools import cache
+from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -107,6 +108,34 @@ def test_a_drive_in_which_the_car_is_lost_sight_of_is_driven_again_slower(
     about = LogReader(log).metadata()["collect"]
     assert about["attempts"] == "2"
     assert 0.85 < float(about["speed_scale"]) / pure_pursuit._SCALES["limit"] < 1
+
+
+def test_a_drive_that_fails_where_it_was_slower_is_slower_everywhere(
+    driven: dict[DrivingStyle, tuple[Driven, Path]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Three drives that spin: the second one where the first did, the third one elsewhere."""
+    whole, _ = driven["calm"]
+    drives, speeds = [], list[Floats]()
+    for row in (150, 150, 300):
+        x = whole.x.copy()
+        x[row, 4] = 5 * x[row, 3]
+        drives.append(replace(whole, true_x=[tuple(one) for one in x]))
+    drives.append(whole)
+
+    monkeypatch.setattr(
+        "bayesrace.operation.collect.PurePursuit", lambda *given, **_: speeds.append(given[3])
+    )
+    monkeypatch.setattr(
+        "bayesrace.operation.collect.ClosedLoop",
+        lambda *_, **__: SimpleNamespace(drive=lambda *_, **__: drives.pop(0)),
+    )
+    monkeypatch.setattr("bayesrace.operation.collect.PythonController", lambda *_: None)
+    log, settings = tmp_path / "drive.mcap", PurePursuitSettings()
+    assert collect(TRACK, at_the_edge(), CAR, tmp_path, log, 12.0, settings) is whole
+    first, again, elsewhere = (b / a for a, b in pairwise(speeds))
+    assert (first.min(), first.max()) == (pytest.approx(0.85), 1.0)
+    np.testing.assert_allclose(again, 0.93)
+    assert (elsewhere.min(), elsewhere.max()) == (pytest.approx(0.85), 1.0)
 
 
 def test_a_drive_is_slower_only_where_something_went_wrong() -> None:

@@ -119,8 +119,9 @@ class CarParameters(Part):
     mirrored_samples: bool = Field(
         False,
         strict=True,
-        description="whether the mirror image of each sample is learned from, too: for a car that "
-        "turns left as it turns right and whose whole state is measured [-]",
+        description="whether the mirror image of each sample is learned from, too, and the car is "
+        "expected to err to both sides alike: for a car that turns left as it turns right and "
+        "whose whole state is measured [-]",
     )
     brake_fade_mps: float = Field(
         default_factory=lambda known: scaled(_BRAKE_FADE_MPS, "m/s", _scales(known)),

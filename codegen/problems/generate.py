@@ -105,6 +105,22 @@ def _hessians_in_x(problem: Problem, multiplier: ca.SX) -> tuple[ca.SX, ca.SX]:
     return ca.hessian(problem.cost, x)[0], ca.hessian(weighted, x)[0]
 
 
+def _effect(problem: Problem) -> np.ndarray[Any, Any]:
+    """What the residual's outputs do to the next state, (nx, outputs), from zeros."""
+    x, u, e = (
+        np.zeros(len(problem.states)),
+        np.zeros(len(problem.inputs)),
+        ca.MX.sym("e", problem.outputs),
+    )
+    effect = ca.Function("effect", [e], [ca.jacobian(problem.f(x, u, e), e)])
+    return np.asarray(ca.densify(effect(np.zeros(problem.outputs))))
+
+
+def _most_changed(problem: Problem) -> list[int]:
+    """The state that each output of the residual changes most."""
+    return [int(one) for one in np.abs(_effect(problem)).argmax(axis=0)]
+
+
 def _model_sparsity(problem: Problem) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:
     """Where Jacobian (nx, nv) and Hessian (nv, nv) of the corrected model may be nonzero."""
     nx, nv = len(problem.states), len(problem.states) + len(problem.inputs)
@@ -120,6 +136,9 @@ def _model_sparsity(problem: Problem) -> tuple[np.ndarray[Any, Any], np.ndarray[
     if problem.outputs:
         corrected = np.flatnonzero(jacobian[:, nv:].any(axis=1))
         j[np.ix_(corrected, features)] = True
+        changed = np.array(_most_changed(problem))  # the mismatch has terms in what changes these
+        j[np.ix_(corrected, changed)] = True
+        j[np.ix_(corrected, np.flatnonzero(j[changed].any(axis=0)))] = True
         crossed = np.flatnonzero(hessian[:nv, nv:].any(axis=1))
         h[np.ix_(crossed, features)] = True
         h[np.ix_(features, crossed)] = True
@@ -223,6 +242,7 @@ def c_header(problem: Problem) -> str:
         _array("BR_INPUT_PROXIMAL", [float(one.proximal) for one in inputs], "double"),
         _array("BR_STATE_DEVIATION", [float(one.deviation) for one in states], "double"),
         _array("BR_INPUT_EFFORT", [float(one.effort) for one in inputs], "double"),
+        _array("BR_CHANGED", _most_changed(problem)),
         _array("BR_STATE_ODD", [one.odd for one in states]),
         _array("BR_INPUT_ODD", [one.odd for one in inputs]),
         _array("BR_INPUT_HELD", [one.held for one in inputs]),

@@ -91,6 +91,10 @@ br_mpc_error br_mpc_set_parameters(br_mpc *mpc, const br_mpc_parameters *paramet
     mpc->has_parameters = 1;
     br_invalidate(mpc, BR_TUBE);
     br_mismatch_undo(&mpc->mismatch);
+    if (mpc->mismatch.any && !(parameters->caution_sigmas > 0)) {
+        br_mismatch_reset(&mpc->mismatch);
+        br_forget_linearisation(mpc);
+    }
     br_evaluate_penalties(mpc);
     mpc->caution.wanted = 0;
     for (int r = 0; r < BR_NR && parameters->caution_sigmas > 0; ++r)
@@ -138,6 +142,10 @@ br_mpc_error br_mpc_observe(br_mpc *mpc, const double x[BR_NX], const double u[B
     if (!br_plausible_state(x) || !br_plausible_state(x_next) ||
         !br_plausible(u, BR_INPUT_LIMIT, BR_NU))
         return BR_ERROR_STATE;
+    for (int i = 0; noise && i < BR_NX; ++i)
+        if (!(noise->corrected[i] >= 0 && noise->step[i] >= 0 &&
+              isfinite(noise->corrected[i] + noise->step[i])))
+            return BR_ERROR_STATE;
     br_transition *newest = &mpc->mismatch.newest;
     newest->duration = duration_s;
     memcpy(newest->x, x, sizeof newest->x);
@@ -275,6 +283,7 @@ static void limit_speeds(br_mpc *mpc) {
 
 /* Other weights are in use from the next step on. */
 static void use(br_mpc *mpc, int buffer) {
+    const int same = mpc->gp[buffer].identity == mpc->gp[mpc->gp_in_use].identity;
     mpc->gp_in_use = buffer;
 #if BR_HAS_PATH
     /* a reference that knows more does not leap ahead */
@@ -285,7 +294,7 @@ static void use(br_mpc *mpc, int buffer) {
     mpc->watch.since = mpc->watch.count;
     memset(mpc->watch.judged, 0, sizeof mpc->watch.judged);
     br_forget_linearisation(mpc);
-    br_mismatch_reset(&mpc->mismatch);
+    if (!same) br_mismatch_reset(&mpc->mismatch); /* it is that of the weights before */
 }
 
 /* The caller has taken the spare buffer and is the control thread. Weights that were in use without

@@ -129,8 +129,8 @@ typedef struct {
                               * largest */
     double pace;             /* of the reference, as a share of the line's speed; 1 where all is
                               * known */
-    double widening;         /* of the residual's standard deviations by what is not known of its
-                              * mismatch, the largest along the plan; 1: nothing is lacking */
+    double widening;         /* of the residual's standard deviations, noise included, by what is
+                              * not known of its mismatch; the largest along the plan */
     double s_ref_m;          /* projection of the car on the racing line */
     double lateral_m;        /* distance of the car from the racing line, positive left */
 } br_mpc_info;
@@ -244,7 +244,8 @@ BR_API double br_mpc_monotonic(void *context);
 
 /* --- the control loop --- */
 
-/* Forgets the previous plan, working set and position on the line, and what slowed the car down. */
+/* Forgets the previous plan, working set and position on the line, what slowed the car down, and
+ * what its model errs by. */
 BR_API void br_mpc_reset(br_mpc *mpc);
 
 /* One control step: projects the car on the racing line, makes the reference, solves, checks.
@@ -285,12 +286,13 @@ BR_API br_mpc_error br_mpc_solve(br_mpc *mpc, const double x[BR_NX], const doubl
                                  br_mpc_status *status, br_mpc_info *info);
 
 /* Compares what the car did between two measured states, under the mean of the inputs that acted
- * meanwhile, with the prediction. What this errs by is estimated: from the step after the next on
- * the model is corrected by it, and caution counts what is not known of it (info->widening), until
- * br_mpc_reset or other weights. For consecutive states of a car that moves, about a stage apart,
- * by the thread that steps; the newest before a step counts. Never needed; without caution it
- * changes nothing. noise: as an estimator has it; NULL: the states are exact. BR_ERROR_TIME for a
- * duration that is not above 0 and at most BR_PREDICT_MAX_S, BR_ERROR_STATE as for br_mpc_predict.
+ * meanwhile, with the prediction. What this errs by is estimated: the tube counts what is not known
+ * of it from the step after the next on (info->widening), and the model is corrected by it from the
+ * one after that on, until br_mpc_reset or other weights. For consecutive states of a car that
+ * moves, about a stage apart, by the thread that steps; the newest before a step counts. Never
+ * needed; without caution it changes nothing. noise: as an estimator has it; NULL: the states are
+ * exact. BR_ERROR_TIME for a duration that is not above 0 and at most BR_PREDICT_MAX_S,
+ * BR_ERROR_STATE as for br_mpc_predict.
  */
 BR_API br_mpc_error br_mpc_observe(br_mpc *mpc, const double x[BR_NX], const double u[BR_NU],
                                    double duration_s, const double x_next[BR_NX],
@@ -376,8 +378,8 @@ BR_API br_instructions br_mpc_get_instructions(const br_mpc *mpc);
 BR_API br_mpc_error br_mpc_variance(br_mpc *mpc, const double v[BR_NV], double variance[BR_NE],
                                     double noise[BR_NE]);
 
-/* Corrected model at v = [x; u]: x_next, J = d x_next / d v (row major) and
- * H = sum_i lambda_i d^2 x_next_i / d v^2. */
+/* Corrected model of the plan, with its mismatch, at v = [x; u]: x_next, J = d x_next / d v (row
+ * major) and H = sum_i lambda_i d^2 x_next_i / d v^2. */
 BR_API br_mpc_error br_mpc_evaluate(const br_mpc *mpc, const double v[BR_NV],
                                     const double lambda[BR_NX], double x_next[BR_NX],
                                     double jacobian[BR_NX * BR_NV], double hessian[BR_NV * BR_NV]);

@@ -107,7 +107,7 @@ static void standard_deviations(br_mpc *mpc, double sigma[BR_N][BR_NE]) {
             const double latent = br_worse(0, variance[i][j] - gp->variance[j].noise);
             const double mismatch = br_mismatch_variance(mpc, stage[i], j);
             sigma[stage[i]][j] = sqrt(latent + mismatch);
-            if (variance[i][j] > 0) ratio = fmax(ratio, mismatch / variance[i][j]);
+            if (variance[i][j] > 0) ratio = br_worse(ratio, mismatch / variance[i][j]);
         }
     mpc->caution.widening = fmin(sqrt(1 + ratio), WIDEST);
     for (int i = 1; i < COUNT; ++i)
@@ -152,10 +152,7 @@ void br_caution_update(br_mpc *mpc) {
     if (was || caution->active) br_invalidate(mpc, BR_TERMS);
     mpc->timer.caution = 0;
     caution->widening = 1;
-    if (!caution->active) {
-        mpc->mismatch.any = 0;
-        return;
-    }
+    if (!caution->active) return;
     const double begin = br_timer_now(&mpc->timer);
     double sigma[BR_N][BR_NE], gain[BR_N][BR_NU][BR_NX];
     standard_deviations(mpc, sigma);
@@ -214,9 +211,7 @@ void br_caution_report(br_mpc *mpc) {
 /* After a step: the speed of the next reference as a share of the line's. It falls where
  * uncertainty takes more than BR_CAUTION_SHARE of the room at a stage, or is not finite, by at most
  * BR_CAUTION_SLOWER per second, and rises elsewhere by at most BR_CAUTION_FASTER, also when nothing
- * is uncertain any more: a reference that leaps ahead spoils the plan. A car that has changed since
- * it was learned errs in the next bend as in this one, so the wider its band has become, the more
- * slowly the reference rises. */
+ * is uncertain any more: a reference that leaps ahead spoils the plan. */
 void br_caution_pace(br_mpc *mpc, double elapsed) {
     br_caution *caution = &mpc->caution;
     double worst = 0;

@@ -279,10 +279,35 @@ static int load(br_gp_output *out, const br_mpc_gp *in) {
            br_all_finite(out->inverse_scale, BR_NZ);
 }
 
+/* FNV-1a, by words. */
+static uint64_t hash(uint64_t so_far, const double *numbers, int count) {
+    for (int i = 0; i < count; ++i) {
+        uint64_t word;
+        memcpy(&word, &numbers[i], sizeof word);
+        so_far = (so_far ^ word) * 1099511628211u;
+    }
+    return so_far;
+}
+
+static uint64_t identity(const br_mpc_gp outputs[BR_NE]) {
+    uint64_t so_far = 14695981039346656037u;
+    for (int j = 0; j < BR_NE; ++j) {
+        const br_mpc_gp *in = &outputs[j];
+        const double numbers[] = {in->kernel, in->n, in->offset, in->scale, in->signal, in->noise};
+        so_far = hash(so_far, numbers, sizeof numbers / sizeof numbers[0]);
+        if (in->n == 0) continue;
+        so_far = hash(so_far, in->length_scales, BR_NZ);
+        so_far = hash(so_far, in->inputs, in->n * BR_NZ);
+        so_far = hash(so_far, in->alpha, in->n);
+    }
+    return so_far;
+}
+
 /* No residual, and an unknown uncertainty. The arrays are written when they are filled, so that
  * memory for points that never come is not taken from the system. */
 void br_gp_clear(br_gp *gp) {
     gp->any = gp->uncertain = 0;
+    gp->identity = 0;
     for (int j = 0; j < BR_NE; ++j) {
         memset(&gp->output[j], 0, offsetof(br_gp_output, inputs));
         memset(&gp->variance[j], 0, offsetof(br_gp_variance, inputs));
@@ -293,6 +318,7 @@ br_mpc_error br_gp_load(br_gp *gp, const br_mpc_gp outputs[BR_NE]) {
     for (int j = 0; j < BR_NE; ++j)
         if (!valid(&outputs[j])) return BR_ERROR_WEIGHTS;
     gp->any = gp->uncertain = 0;
+    gp->identity = identity(outputs);
     for (int j = 0; j < BR_NE; ++j) {
         /* finite numbers may overflow once scaled: refused here, not found out while driving */
         if (!load(&gp->output[j], &outputs[j])) return BR_ERROR_WEIGHTS;

@@ -40,7 +40,7 @@ typedef struct {
     double uu[2 * BR_NU][2 * BR_NU];                         /* of [u; u_before] */
 } br_stage_curvature;
 
-enum { BR_NM = 1 + BR_NZ + BR_NE }; /* terms of the mismatch: 1, features, what a stage changes */
+enum { BR_NPHI = 1 + BR_NZ + BR_NE }; /* terms of the mismatch: see br_mismatch.c */
 
 /* Linearisation of the corrected model at one stage. */
 typedef struct {
@@ -49,8 +49,9 @@ typedef struct {
     double hessian[BR_NV][BR_NV]; /* weighted with the costate of the stage's end; made later */
     double in_e[BR_NX][BR_NE];    /* the nominal model's Jacobian in the residual */
     br_correction residual;
-    double terms[BR_NM]; /* of the mismatch, by the model without it */
-    int slot;            /* where the weights of its kernels are kept */
+    double phi[BR_NPHI]; /* terms of the mismatch, by the model without it: */
+    double plain_f[BR_NX], plain_jacobian[BR_NX][BR_NV];
+    int slot; /* where the weights of its kernels are kept */
 } br_stage;
 
 typedef struct {
@@ -147,31 +148,28 @@ typedef struct {
     br_judged judged[BR_WATCHED]; /* the newest */
 } br_watch;
 
-/* The model's mismatch, by what the car has done lately: see br_mismatch.c. */
-/* What the errors of the corrected model say of one output, older ones less. */
+/* Of one output: what the errors of the corrected model say, older ones less, and what follows. */
 typedef struct {
-    double information[BR_NM][BR_NM], projection[BR_NM]; /* sums of terms terms' / r, terms y / r */
-    double squares, precision, count;                    /* sums of y y / r, 1 / r, 1 */
-    double excess;   /* mean square of what the weights leave, over r */
-    double surprise; /* of the newest errors, over that */
-    double prior;    /* variance of a weight before anything has been seen */
-} br_evidence;
-
-/* What follows of that: y = weight' terms, and how sure that is. */
-typedef struct {
-    double weight[BR_NM];
-    double factor[BR_NM][BR_NM]; /* Cholesky factor of the weights' inverse covariance, with the
-                                    reciprocals of its diagonal */
-    double unexplained;          /* variance of y beside r */
+    double information[BR_NPHI][BR_NPHI], projection[BR_NPHI]; /* sums of phi phi' / r, phi y / r */
+    double squares, precision, count;                          /* sums of y y / r, 1 / r, 1 */
+    double surprise;    /* mean square of the newest errors, over that of all */
+    double prior;       /* variance of a weight before anything has been seen */
+    double noise_scale; /* mean square of what the weights leave, over r; ... */
+    double scaled_by;   /* ... the one that these belong to: */
+    double weight[BR_NPHI];
+    double factor[BR_NPHI][BR_NPHI]; /* Cholesky factor of their inverse covariance, with the
+                                        reciprocals of its diagonal */
+    double unexplained;              /* variance of y beside r */
 } br_regression;
 
+/* The model's mismatch, by what the car has done lately: see br_mismatch.c. */
 typedef struct {
     br_transition newest, due; /* due: observed before the last step */
-    int judged;                /* what is due is in evidence, else in neither */
-    br_evidence evidence[BR_NE], before[BR_NE];
-    br_regression found[BR_NE]; /* of the evidence; in use from the next step on: */
-    double weight[BR_NE][BR_NM];
-    int any; /* weights are in use that are not 0 */
+    int judged;                /* what is due is in the regressions, else in neither: */
+    br_regression of[BR_NE], before[BR_NE];
+    double weight[BR_NE][BR_NPHI]; /* of these, since the last step */
+    int any;                       /* there are such weights; ... */
+    int renewed;                   /* ... and stages that are linearised with those before */
 } br_mismatch;
 
 /* What the residual's uncertainty does to the plan: see br_caution.c. */
@@ -287,7 +285,6 @@ struct br_mpc {
     double answer_tube[BR_N];                                /* how uncertain it is */
     br_timer timer;
     br_caution caution;
-    int changed[BR_NE]; /* the state that each output of the residual changes most */
     br_mismatch mismatch;
     br_watch watch;
     br_stage stage[BR_N];
@@ -419,8 +416,6 @@ BR_PART __typeof__(br_mpc_steer) br_steer;
 
 /* --- br_mismatch.c: what the corrected model errs by lately --- */
 
-/* Into mpc->changed, by the linearisation of stage 0. */
-BR_PART void br_find_changed(br_mpc *mpc);
 BR_PART void br_mismatch_reset(br_mismatch *mismatch);
 /* A step has been made: what was observed before it is due. */
 BR_PART void br_mismatch_advance(br_mismatch *mismatch);
@@ -437,9 +432,11 @@ BR_PART void br_mismatch_mean(const br_mpc *mpc, const double x[BR_NX], const do
 /* To a stage that is linearised without it, to first order in it. */
 BR_PART void br_mismatch_add(const br_mpc *mpc, const double x[BR_NX], const double u[BR_NU],
                              br_stage *stage);
-/* With what this adds to lambda, lambda' F has the second derivatives of lambda' (F + F_e w' phi):
- * phi is linear in [x; u] and F. */
-BR_PART void br_mismatch_price(const br_mpc *mpc, const br_stage *stage, double lambda[BR_NX]);
+/* To stages that are linearised with the mismatch before: the one in use. */
+BR_PART void br_mismatch_renew(br_mpc *mpc);
+/* With what this adds to lambda, lambda' F has the second derivatives of lambda' (F + F_e w' phi),
+ * as phi is linear in [x; u] and F; but for those of F_e. */
+BR_PART void br_mismatch_costate(const br_mpc *mpc, const br_stage *stage, double lambda[BR_NX]);
 
 /* --- br_watch.c: what the car does against predictions --- */
 

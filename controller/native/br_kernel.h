@@ -40,7 +40,8 @@ typedef struct {
 
 typedef struct {
     int any; /* 0 while every output is constant zero: WorstCase and BestCase skip the kernels */
-    int uncertain; /* the variance of an output is known */
+    int uncertain;     /* the variance of an output is known */
+    uint64_t identity; /* of the weights that are loaded: equal if these are */
     br_gp_output output[BR_NE];
     br_gp_variance variance[BR_NE];
 } br_gp;

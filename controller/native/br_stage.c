@@ -176,7 +176,6 @@ void br_linearise_stages(br_mpc *mpc, int first, int stages, int slot) {
     mpc->valid[BR_LINEARISATION] = 1;
     stages_linearise(&mpc->gp[mpc->gp_in_use], stages, &mpc->plan.x[first], &mpc->plan.u[first],
                      mpc->kernels, BR_N, slot, &mpc->stage[first]);
-    br_find_changed(mpc);
     for (int k = first; k < first + stages; ++k)
         br_mismatch_add(mpc, mpc->plan.x[k], mpc->plan.u[k], &mpc->stage[k]);
 }
@@ -189,7 +188,7 @@ void br_curve_plan(br_mpc *mpc) {
     mpc->curved = 1;
     double lambda[BR_N][BR_NX];
     memcpy(lambda, mpc->plan.costate[1], sizeof lambda);
-    for (int k = 0; k < BR_N; ++k) br_mismatch_price(mpc, &mpc->stage[k], lambda[k]);
+    for (int k = 0; k < BR_N; ++k) br_mismatch_costate(mpc, &mpc->stage[k], lambda[k]);
     stages_curve(&mpc->gp[mpc->gp_in_use], BR_N, mpc->plan.x, mpc->plan.u, lambda, mpc->kernels,
                  mpc->stage);
 }
@@ -313,7 +312,7 @@ br_mpc_error br_evaluate(const br_mpc *mpc, const double v[BR_NV], const double 
     br_stage stage;
     stages_linearise(gp, 1, x, u, kernels, 1, 0, &stage);
     br_mismatch_add(mpc, x[0], u[0], &stage);
-    br_mismatch_price(mpc, &stage, costate[0]);
+    br_mismatch_costate(mpc, &stage, costate[0]);
     stages_curve(gp, 1, x, u, costate, kernels, &stage);
     memcpy(x_next, stage.f, sizeof stage.f);
     memcpy(jacobian, stage.jacobian, sizeof stage.jacobian);

@@ -42,6 +42,7 @@ void br_forget_linearisation(br_mpc *mpc) {
 /* The plan, shifted that often since the step before and linearised. */
 static void align(br_mpc *mpc, int shifts) {
     if (shifts < mpc->ahead) undo_preparation(mpc); /* the step comes sooner than expected */
+    br_mismatch_renew(mpc);
     for (; mpc->ahead < shifts; mpc->ahead += 1) br_sqp_shift(mpc);
     if (!mpc->valid[BR_LINEARISATION]) br_linearise_plan(mpc);
 }

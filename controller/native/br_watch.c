@@ -22,7 +22,7 @@ static int sample_of(const br_mpc *mpc, const br_transition *seen, br_sample *sa
     if (br_predict_by(mpc, NULL, seen->x, seen->u, seen->duration, nominal)) return 0;
     br_stage_features(seen->x, seen->u, sample->z);
     for (int j = 0; j < BR_NE; ++j) {
-        const int i = mpc->changed[j];
+        const int i = BR_CHANGED[j];
         const double share = mpc->stage[0].in_e[i][j] * stages;
         if (share == 0) return 0; /* before the first linearisation */
         sample->residual[j] = (seen->x_next[i] - nominal[i]) / share;
