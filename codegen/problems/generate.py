@@ -105,20 +105,13 @@ def _hessians_in_x(problem: Problem, multiplier: ca.SX) -> tuple[ca.SX, ca.SX]:
     return ca.hessian(problem.cost, x)[0], ca.hessian(weighted, x)[0]
 
 
-def _effect(problem: Problem) -> np.ndarray[Any, Any]:
-    """What the residual's outputs do to the next state, (nx, outputs), from zeros."""
-    x, u, e = (
-        np.zeros(len(problem.states)),
-        np.zeros(len(problem.inputs)),
-        ca.MX.sym("e", problem.outputs),
-    )
-    effect = ca.Function("effect", [e], [ca.jacobian(problem.f(x, u, e), e)])
-    return np.asarray(ca.densify(effect(np.zeros(problem.outputs))))
-
-
 def _most_changed(problem: Problem) -> list[int]:
-    """The state that each output of the residual changes most."""
-    return [int(one) for one in np.abs(_effect(problem)).argmax(axis=0)]
+    """The state that each output of the residual changes most, from a state and input of zeros."""
+    e = ca.MX.sym("e", problem.outputs)
+    ahead = problem.f(np.zeros(len(problem.states)), np.zeros(len(problem.inputs)), e)
+    effect = ca.Function("effect", [e], [ca.jacobian(ahead, e)])
+    found = np.asarray(ca.densify(effect(np.zeros(problem.outputs))))
+    return [int(one) for one in np.abs(found).argmax(axis=0)]
 
 
 def _model_sparsity(problem: Problem) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:

@@ -11,10 +11,10 @@
  * scaled. This is a Bayesian linear regression that forgets (Bishop, "Pattern Recognition and
  * Machine Learning", 2006, section 3.3): weights are N(0, s^2 I) before anything is seen, in units
  * of the deviations that the problem names, and s^2 follows the evidence (3.5), so that a model
- * that is right is left as it is. Of a bend to the left alone a term that is the same to the right
- * could not be told from one that is not; terms that do not behave in a mirror as the output does
- * have smaller weights therefore. What surprises several times in a row makes the rest be
- * forgotten.
+ * that is right is left as it is. After bends to the left alone a term that has the same sign in
+ * both directions cannot be told from one that changes it. So terms that change their sign in a
+ * mirror where the output does not, or the other way round, have smaller weights. Several
+ * surprising errors in a row make older ones be forgotten.
  *
  * The plan's model becomes F + F_e w' phi, and the residual's variance there the posterior's
  * without noise, plus phi' P phi with P the covariance of w, plus what the regression does not
@@ -84,23 +84,22 @@ void br_mismatch_undo(br_mismatch *mismatch) {
     mismatch->judged = 0;
 }
 
-/* A single error that is far from what is expected is taken for a smaller one. */
-static double clipped(const br_regression *of, const double weight[BR_NPHI],
-                      const double phi[BR_NPHI], double y, double r) {
-    const double most = LARGEST * sqrt(fmax(of->noise_scale, 1) * r);
-    double expected = 0;
-    for (int a = 0; a < BR_NPHI; ++a) expected += weight[a] * phi[a];
-    return expected + fmin(fmax(y - expected, -most), most);
+static double dot(const double a[BR_NPHI], const double b[BR_NPHI]) {
+    double sum = 0;
+    for (int k = 0; k < BR_NPHI; ++k) sum += a[k] * b[k];
+    return sum;
+}
+
+/* A single error that is far from what is usual is taken for a smaller one. usual: a variance. */
+static double clipped(double error, double usual) {
+    const double most = LARGEST * sqrt(usual);
+    return fmin(fmax(error, -most), most);
 }
 
 /* Several in a row, and what was before says little of the car any more: the share that is kept of
  * it. */
-static double kept_share(br_regression *of, const double weight[BR_NPHI], const double phi[BR_NPHI],
-                         double y, double r, double stages) {
-    double error = y;
-    for (int a = 0; a < BR_NPHI; ++a) error -= weight[a] * phi[a];
-    const double square = error * error / (fmax(of->noise_scale, 1) * r);
-    of->surprise += fmin(stages / RECENT, 1) * (square - of->surprise);
+static double kept_share(br_regression *of, double error, double usual, double stages) {
+    of->surprise += fmin(stages / RECENT, 1) * (error * error / usual - of->surprise);
     const double rate = BR_TS / REMEMBERED_S * fmax(of->surprise / SURPRISING, 1);
     return exp(-stages * fmin(rate, 1 / RECENT));
 }
@@ -118,9 +117,9 @@ static void remember(br_regression *of, const double phi[BR_NPHI], double y, dou
     if (!isfinite(of->squares + of->precision)) memset(of, 0, sizeof *of);
 }
 
-/* Share of s^2 that a weight of an output has: one of a term that does not behave in a mirror as
- * the output does, such as the constant lateral error of a wheel that is set wrongly, has a small
- * one.
+/* Share of s^2 that a weight of an output has: little if in a mirror its term and the output do not
+ * both change their sign or both keep it, as with the constant error of a wheel that is set
+ * wrongly.
  */
 static double prior_share(int output, int a) {
     int odd = 0;
@@ -159,11 +158,8 @@ static double regress(int output, double prior, br_regression *of) {
 /* Mean square of what the weights leave, over r. */
 static double mean_square_left(const br_regression *of) {
     double sum = of->squares;
-    for (int a = 0; a < BR_NPHI; ++a) {
-        double row = -2 * of->projection[a];
-        for (int b = 0; b < BR_NPHI; ++b) row += of->information[a][b] * of->weight[b];
-        sum += of->weight[a] * row;
-    }
+    for (int a = 0; a < BR_NPHI; ++a)
+        sum += of->weight[a] * (dot(of->information[a], of->weight) - 2 * of->projection[a]);
     return sum / of->count;
 }
 
@@ -199,8 +195,9 @@ void br_mismatch_judge(br_mpc *mpc, const double variance[BR_NE]) {
         const double measured = due->noise.corrected[i] / (share * share);
         const double r = CORRELATED * fmax(variance[j] - noise, 0) + noise + measured;
         if (!(r > 0 && isfinite(r))) continue;
-        const double y = clipped(of, m->weight[j], phi, (due->x_next[i] - end[i]) / share, r);
-        remember(of, phi, y, r, kept_share(of, m->weight[j], phi, y, r, stages));
+        const double expected = dot(m->weight[j], phi), usual = fmax(of->noise_scale, 1) * r;
+        const double error = clipped((due->x_next[i] - end[i]) / share - expected, usual);
+        remember(of, phi, expected + error, r, kept_share(of, error, usual, stages));
         maximise_evidence(j, of);
     }
 }
@@ -211,13 +208,13 @@ double br_mismatch_variance(const br_mpc *mpc, int stage, int output) {
     const br_regression *of = &mpc->mismatch.of[output];
     if (!(of->count > 0)) return 0;
     const double *phi = mpc->stage[stage].phi;
-    double solved[BR_NPHI], sum = 0, mean = 0;
+    const double mean = dot(of->weight, phi);
+    double solved[BR_NPHI], sum = 0;
     for (int a = 0; a < BR_NPHI; ++a) {
         solved[a] = phi[a];
         for (int k = 0; k < a; ++k) solved[a] -= of->factor[a][k] * solved[k];
         solved[a] *= of->factor[a][a];
         sum += solved[a] * solved[a];
-        mean += of->weight[a] * phi[a];
     }
     const double leverage = sum * of->precision / (of->scaled_by * BR_NPHI);
     return sum + of->unexplained + NONLINEAR * NONLINEAR * leverage * mean * mean;
@@ -225,10 +222,7 @@ double br_mismatch_variance(const br_mpc *mpc, int stage, int output) {
 
 /* w' phi of each output. */
 static void error_of(const br_mpc *mpc, const double phi[BR_NPHI], double error[BR_NE]) {
-    for (int j = 0; j < BR_NE; ++j) {
-        error[j] = 0;
-        for (int a = 0; a < BR_NPHI; ++a) error[j] += mpc->mismatch.weight[j][a] * phi[a];
-    }
+    for (int j = 0; j < BR_NE; ++j) error[j] = dot(mpc->mismatch.weight[j], phi);
 }
 
 void br_mismatch_mean(const br_mpc *mpc, const double x[BR_NX], const double u[BR_NU],
