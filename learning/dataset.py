@@ -15,7 +15,7 @@ from bayesrace.errors import InputError
 from bayesrace.learning.drives import Estimates
 from bayesrace.vehicles.parameters import CarParameters
 
-__all__ = ["ROUNDING", "SIGMAS", "Dataset", "concatenate", "dataset_from_arrays", "filter_dataset"]
+__all__ = ["MIRRORED_FEATURES", "MIRRORED_OUTPUTS", "ROUNDING", "SIGMAS", "Dataset", "concatenate", "dataset_from_arrays", "filter_dataset"]
 __all__ += ["consecutive", "left_out"]
 
 ROUNDING: Final = 1e-6
@@ -28,6 +28,9 @@ SIGMAS: Final = 4.0
 _MIRRORED_STATE: Final = np.array([1.0, -1.0, -1.0, 1.0, -1.0, -1.0, -1.0])
 _MIRRORED_INPUT: Final = np.array([1.0, -1.0])
 """Signs of x, y, psi, vx, vy, omega, delta, and of d, delta_rate, in a mirror along the x axis."""
+MIRRORED_FEATURES: Final = np.concatenate([_MIRRORED_STATE[3:], _MIRRORED_INPUT])
+MIRRORED_OUTPUTS: Final = tuple(_MIRRORED_STATE[3:6].tolist())
+"""The same signs of the features of a residual, and of its outputs."""
 
 
 @dataclass(frozen=True, eq=False)

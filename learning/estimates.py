@@ -1,11 +1,10 @@
 """Samples of states that are estimated: smoothed by a random walk as they are read, and by the
 learned model as they are learned from."""
 
-import math
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Final
+from typing import Final, Protocol, TypeVar
 
 import numpy as np
 
@@ -14,12 +13,13 @@ from bayesrace.columns import Columns
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import GpWeights
 from bayesrace.integrators import PREDICTION, Discretisation
+from bayesrace.learning.conditioning import conditioned
 from bayesrace.learning.dataset import ROUNDING, Dataset, consecutive
 from bayesrace.learning.drives import Drive, Estimates
 from bayesrace.learning.smoothing import Smoothed, corrected_steps, smooth
 from bayesrace.vehicles.parameters import CarParameters
 
-__all__ = ["smoothed_again", "smoothed_in_turns", "smoothed_states"]
+__all__ = ["learned_in_turns", "smoothed_again", "smoothed_states"]
 
 _NO_POSITION: Final = "no position was read"
 _NO_STEERING: Final = "no steering angle is known"
@@ -31,11 +31,18 @@ _REMEDIES: Final = {
 """By the reason why a part of a drive is left out."""
 
 _NX: Final = 7
-_ROUNDS: Final = 4
+_ROUNDS: Final = 2
 _NOISE: Final = 0.65
-"""Of the noise that weights state, what smoothing takes for their model's. The rest is what the
-smoothing before left unknown, which it would only confirm: with all of it, noise falls by a tenth
-each round."""
+"""Of the noise that is learned from smoothed states, what is the model's. The rest is what the
+smoothing left unknown, which the next one would only confirm."""
+
+
+class _Learned(Protocol):
+    @property
+    def weights(self) -> GpWeights: ...
+
+
+L = TypeVar("L", bound=_Learned)
 
 
 def smoothed_states(
@@ -72,50 +79,53 @@ def smoothed_states(
 
 def smoothed_again(
     dataset: Dataset, discretisation: Discretisation, weights: GpWeights
-) -> tuple[Dataset, float]:
-    """The same samples, those whose drives are at hand smoothed by the corrected model; and the
-    mean log likelihood of what was read in these."""
+) -> Dataset | None:
+    """The same samples, those whose drives are at hand smoothed by the corrected model; None where
+    it cannot follow one of them."""
     estimates = dataset.estimates
-    if estimates is None or not estimates.drives:
-        return dataset, 0.0
+    if estimates is None:
+        return dataset
     x, x_next, deviation = dataset.x.copy(), dataset.x_next.copy(), estimates.deviation.copy()
-    likelihood, count = 0.0, 0
+    drives: list[Drive] = []
     for number, drive in enumerate(estimates.drives):
         found = smooth(drive, dataset.car, discretisation, weights)
         own = np.flatnonzero(estimates.origin[:, 0] == number)
         if found is None:
-            return dataset, -math.inf
+            return None
         place = np.searchsorted(found.rows, estimates.origin[own, 1])
         x[own], x_next[own] = found.x[place, :_NX], found.x[place + 1, :_NX]
-        spread = _deviation(found, drive, dataset.car, discretisation, weights)
-        deviation[own] = spread[place]
-        likelihood, count = likelihood + found.log_likelihood, count + len(drive.readings)
-    again = replace(estimates, deviation=deviation)
-    return replace(dataset, x=x, x_next=x_next, estimates=again), likelihood / max(count, 1)
+        deviation[own] = _deviation(found, drive, dataset.car, discretisation, weights)[place]
+        drives.append(replace(drive, path=found.path))
+    again = replace(estimates, deviation=deviation, drives=tuple(drives))
+    return replace(dataset, x=x, x_next=x_next, estimates=again)
 
 
-def smoothed_in_turns(
+def learned_in_turns(
     dataset: Dataset,
     discretisation: Discretisation,
     weights: GpWeights | None,
-    learn: Callable[[Dataset, GpWeights | None], GpWeights],
-) -> Dataset:
-    """The samples smoothed and learned from in turn: those of the round whose weights make it most
-    likely what was read in the drives. ``weights``: that drove, to begin with, their noise taken to
-    be as much less as that of others; ``learn``: new ones from samples, beginning with others.
+    learn: Callable[[Dataset, GpWeights | None], L],
+    capacity: int,
+) -> tuple[Dataset, L, GpWeights | None]:
+    """The samples smoothed, what ``learn`` has made of them, and its weights conditioned on the
+    readings, each by the weights before, ``weights`` or such of the samples as they are given.
 
-    Variances are not to be widened by ``learn``, and what smoothing leaves unknown is to count as
-    noise: else the model would confirm itself, surer each time.
+    None in place of the last where no model can follow the drives. ``capacity``: points of an
+    output at most. Variances are not to be widened by ``learn``.
     """
-    best, score = dataset, -math.inf
-    for number in range(_ROUNDS):
-        if weights is None or number:
-            weights = learn(dataset, weights)
-        weights = _surer(weights)
-        dataset, found = smoothed_again(dataset, discretisation, weights)
-        if found > score:
-            best, score = dataset, found
-    return best
+    made, found = learn(dataset, weights), None
+    before = _surer(weights or made.weights)
+    for _ in range(_ROUNDS):
+        smoothed = smoothed_again(dataset, discretisation, before)
+        if smoothed is None:
+            break
+        again = learn(smoothed, before)
+        try:
+            found = conditioned(again.weights, smoothed, discretisation, capacity, _NOISE)
+        except np.linalg.LinAlgError:
+            break
+        dataset, made, before = smoothed, again, found
+    return dataset, made, found
 
 
 def _surer(weights: GpWeights) -> GpWeights:

@@ -35,7 +35,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from bayesrace.arrays import Floats, Rows
-from bayesrace.gp.expression import mean_function
+from bayesrace.gp.expression import evaluate_mean, mean_function
 from bayesrace.gp.weights import GpWeights
 from bayesrace.integrators import Discretisation, pose_from_velocities
 from bayesrace.learning.drives import POSE, Drive, Event, Measured
@@ -43,7 +43,8 @@ from bayesrace.learning.validation import NOMINAL, predictive_sigma
 from bayesrace.vehicles.parameters import CarParameters
 from bayesrace.vehicles.parts import GRAVITY_MPS2
 
-__all__ = ["Smoothed", "corrected_steps", "smooth"]
+__all__ = ["EXCEEDED", "REFUSED", "Smoothed", "Steps", "begins", "blurred", "corrected_steps"]
+__all__ += ["innovation", "inputs_of", "observation", "smooth", "started"]
 
 _NX: Final = 7
 _NB: Final = 9
@@ -54,9 +55,9 @@ _JERK_S: Final = 0.1
 _SEARCHED: Final = (4, 75)
 """Windows of a drive, evenly spread, and periods in each, that the random walk's noise is found
 by."""
-_EXCEEDED: Final = {n: float(chdtri(n, 0.001)) for n in range(1, _NX + 1)}
+EXCEEDED: Final = {n: float(chdtri(n, 0.001)) for n in range(1, _NX + 1)}
 """Squared distances that one of 1,000 right readings exceeds, as in the C code."""
-_REFUSED: Final = 5
+REFUSED: Final = 5
 """Readings of an instrument in a row: then it is the filter that is wrong."""
 _LINEARISED: Final = 2
 """Passes along the result of the one before."""
@@ -139,17 +140,14 @@ def _updated(
     """With a reading, where the gate lets it pass, or has refused too many of its instrument in a
     row (``refused``, (b,)); adds to the likelihoods (b,)."""
     of, m = measured.states, x.shape[1]
-    h, r = _observation(of, m), np.diag(measured.variance)
+    h, r = observation(of, m), np.diag(measured.variance)
     hp = h @ p
     s = hp @ h.T + r
-    new = measured.value - x @ h.T
-    if 2 in of:
-        k = of.index(2)
-        new[:, k] = np.remainder(new[:, k] + np.pi, 2 * np.pi) - np.pi
+    new = innovation(measured, x, h)
     weighted = np.linalg.solve(s, np.concatenate([new[..., None], hp], axis=2))
     squared = np.einsum("bi,bi->b", new, weighted[..., 0])
-    limit = gate * _EXCEEDED[len(of)] if gate > 0 else np.inf
-    passed = (squared <= limit) | (refused >= _REFUSED)
+    limit = gate * EXCEEDED[len(of)] if gate > 0 else np.inf
+    passed = (squared <= limit) | (refused >= REFUSED)
     refused[:] = np.where(squared <= limit, 0, refused + 1)
     likelihood -= 0.5 * (np.minimum(squared, limit) + np.linalg.slogdet(s)[1])
     gain = np.swapaxes(weighted[..., 1:], 1, 2) * passed[:, None, None]
@@ -158,7 +156,18 @@ def _updated(
     return x + np.einsum("bij,bj->bi", gain, new), p
 
 
-def _observation(of: Sequence[int], m: int) -> Floats:
+def innovation(measured: Measured, x: Floats, h: Floats) -> Floats:
+    """What a reading differs by from what it would be at ``x`` (b, m), where it is ``h`` x."""
+    new = measured.value - x @ h.T
+    if 2 in measured.states:
+        k = measured.states.index(2)
+        new[:, k] = np.remainder(new[:, k] + np.pi, 2 * np.pi) - np.pi
+    return new
+
+
+def observation(of: Sequence[int], m: int) -> Floats:
+    """Matrix (n, m) of the readings of the states ``of``, with the offsets of those that have
+    one."""
     h = np.zeros((len(of), m))
     h[range(len(of)), of] = 1
     h[:, 7] += h[:, 5]
@@ -210,11 +219,12 @@ def smooth(
     path = _walked(events, drive, car).path if drive.path is None else drive.path
     for _ in range(_LINEARISED):
         model = _corrected(events, path[:, :_NB], car, discretisation, weights)
-        x0, p0 = _start(events[0], drive, car, path[0, :_NB])
+        x0, p0 = started(events[0], drive, car, path[0, :_NB])
+        read = blurred(events, path, discretisation.step_s, weights)
         try:
             with np.errstate(over="ignore", invalid="ignore"):
-                made = _forward(events, x0[None], p0[None], model, car.tuning.estimator.gate)
-                found = _backward(events, made)
+                made = _forward(read, x0[None], p0[None], model, car.tuning.estimator.gate)
+                found = _backward(read, made)
         except np.linalg.LinAlgError:  # what is believed has run away
             return None
         path = found.path
@@ -233,7 +243,7 @@ def _possible(path: Floats, car: CarParameters) -> bool:
     return bool((np.abs(path[:, :_NX]) <= bounds).all())
 
 
-def _start(first: Event, drive: Drive, car: CarParameters, around: Floats) -> tuple[Floats, Floats]:
+def started(first: Event, drive: Drive, car: CarParameters, around: Floats) -> tuple[Floats, Floats]:
     """Mean and covariance after the first pose."""
     x, settings = around.copy(), car.tuning.estimation(nominal=True)
     p = np.diag(np.square(settings["start"]))
@@ -250,7 +260,7 @@ def _start(first: Event, drive: Drive, car: CarParameters, around: Floats) -> tu
     return x, p
 
 
-def _columns(events: Sequence[Event]) -> tuple[Floats, Floats]:
+def inputs_of(events: Sequence[Event]) -> tuple[Floats, Floats]:
     """Inputs (2, e) and durations (1, e)."""
     return np.array([one.u for one in events]).T, np.array([[one.duration_s for one in events]])
 
@@ -261,6 +271,40 @@ def _stacked(matrix: Any, count: int) -> Floats:
     return array.reshape(len(array), count, -1).transpose(1, 0, 2)
 
 
+def begins(events: Sequence[Event], path: Floats) -> Floats:
+    """Where the period of each event but the first has begun, (e - 1, 7), on ``path`` (e, 7 or
+    more)."""
+    ends = [i if i == 0 or one.period >= 0 else 0 for i, one in enumerate(events[:-1])]
+    return path[np.maximum.accumulate(ends), :_NX]
+
+
+def blurred(
+    events: Sequence[Event], path: Floats, step_s: float, weights: GpWeights
+) -> list[Event]:
+    """Readings of velocities with what the corrected model errs by within periods in their
+    variance.
+
+    The residual acts evenly in a period, though it changes from one to the next: by dg, as if it
+    were linear in time, it has left out dg tau (1 - tau) / 2 after a share tau of the period.
+    """
+    u, h = inputs_of(events[1:])
+    period = np.cumsum([0, *(one.period >= 0 for one in events[1:-1])])
+    first = np.searchsorted(period, np.arange(period[-1] + 1))
+    if len(first) < 2:
+        return list(events)
+    residual = evaluate_mean(weights, np.column_stack([begins(events, path)[:, 3:], u.T])[first])
+    passed = np.cumsum(h[0])
+    tau = np.clip((passed - (passed - h[0])[first][period]) / step_s, 0, 1)
+    error = np.gradient(residual, axis=0)[period] * (tau * (1 - tau) / 2)[:, None]
+    found = [events[0]]
+    for event, by in zip(events[1:], error, strict=True):
+        if (one := event.measured) is not None and {3, 4, 5} & set(one.states):
+            added = [by[k - 3] ** 2 if 3 <= k <= 5 else 0.0 for k in one.states]
+            event = event._replace(measured=one._replace(variance=one.variance + added))
+        found.append(event)
+    return found
+
+
 def _corrected(
     events: Sequence[Event],
     path: Floats,
@@ -269,9 +313,8 @@ def _corrected(
     weights: GpWeights,
 ) -> _Transition:
     """The corrected model, linearised along the path."""
-    before, (u, h), e = path[:-1], _columns(events[1:]), len(events) - 1
-    ends = [i if i == 0 or one.period >= 0 else 0 for i, one in enumerate(events[:-1])]
-    begin = path[np.maximum.accumulate(ends), :_NX]
+    before, (u, h), e = path[:-1], inputs_of(events[1:]), len(events) - 1
+    begin = begins(events, path)
     step = corrected_steps(before[:, :_NX], begin, u.T, h[0], car, discretisation, weights)
     z, period = _periods(begin, u.T)
     sigma = predictive_sigma(weights, z)[period]
@@ -368,9 +411,9 @@ def _jerk(h: Floats, psi: Floats) -> Floats:
 
 def _walked(events: Sequence[Event], drive: Drive, car: CarParameters) -> Smoothed:
     """By the random walk of the velocities, with the noise that makes the readings most likely."""
-    walk, (u, h) = _walk(), _columns(events)
+    walk, (u, h) = _walk(), inputs_of(events)
     x0, p0 = np.zeros(_NB + 3), np.zeros((_NB + 3, _NB + 3))
-    x0[:_NB], p0[:_NB, :_NB] = _start(events[0], drive, car, np.zeros(_NB))
+    x0[:_NB], p0[:_NB, :_NB] = started(events[0], drive, car, np.zeros(_NB))
     full = car.friction * GRAVITY_MPS2 * np.array([1, 1, 1 / car.wheelbase_m])
     p0[_NB:, _NB:] = np.diag(full**2)
     gate, middle = car.tuning.estimator.gate, full**2 / _JERK_S

@@ -54,7 +54,7 @@ from bayesrace.gp.weights import (
 )
 from bayesrace.integrators import Discretisation
 from bayesrace.learning.dataset import Dataset, concatenate, left_out
-from bayesrace.learning.estimates import smoothed_in_turns
+from bayesrace.learning.estimates import learned_in_turns
 from bayesrace.learning.gaussian_process import Fit, PairDistances, maximise, refine, starts
 from bayesrace.learning.settings import MIN_SAMPLES, Progress, TrainingSettings
 from bayesrace.learning.subset import bounded, evenly, most_informative, spans, stretches
@@ -119,14 +119,31 @@ def fit(
         raise InputError(
             f"GP training: cannot start from weights for {initial.discretisation}, this is {model}"
         )
-    if dataset.estimates is not None and dataset.estimates.drives:
+    if dataset.estimates is None or not dataset.estimates.drives:
+        return _fit(dataset, discretisation, settings, initial, widen, report)
 
-        def learn(samples: Dataset, before: GpWeights | None) -> GpWeights:
-            return _fit(samples, discretisation, settings, before, 1.0, report).weights
+    def learn(samples: Dataset, before: GpWeights | None) -> Training:
+        return _fit(samples, discretisation, settings, before, 1.0, report)
 
-        with threadpool_limits(1, "blas"):  # threads would wait for each other
-            dataset = smoothed_in_turns(dataset, discretisation, initial, learn)
-    return _fit(dataset, discretisation, settings, initial, widen, report)
+    with threadpool_limits(1, "blas"):  # threads would wait for each other
+        dataset, made, found = learned_in_turns(
+            dataset, discretisation, initial, learn, settings.capacity
+        )
+    if found is None:  # no model can follow the drives
+        return _fit(dataset, discretisation, settings, initial, widen, report)
+    return Training(_named(found), made.kernels, dataset)
+
+
+def _named(weights: GpWeights) -> GpWeights:
+    """Named by content: the same samples and settings always give the same version."""
+    plain = replace(weights, version="unnamed", created_utc_ns=0, program="")
+    digest = hashlib.sha256(encode_weights(plain)).hexdigest()
+    return replace(
+        plain,
+        version=f"{weights.car}-{digest[:10]}",
+        created_utc_ns=time.time_ns(),
+        program=f"bayesrace {__version__}",
+    )
 
 
 def _fit(
@@ -183,15 +200,7 @@ def _fit(
         sample_features=dataset.features[checked],
         sample_residuals=errors[checked],
     )
-    # Named by content: the same samples and settings always give the same version.
-    digest = hashlib.sha256(encode_weights(weights)).hexdigest()
-    weights = replace(
-        weights,
-        version=f"{weights.car}-{digest[:10]}",
-        created_utc_ns=time.time_ns(),
-        program=f"bayesrace {__version__}",
-    )
-    return Training(weights, tuple(kernels), dataset)
+    return Training(_named(weights), tuple(kernels), dataset)
 
 
 def _check(dataset: Dataset, errors: Floats) -> None:

@@ -6,7 +6,7 @@ weights are the caller's: nothing validates them, and no command can stop the ru
 """
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from typing import Any, Final
@@ -192,8 +192,10 @@ class ClosedLoop:
         start_speed_mps: float = 0.1,
         x0: Sequence[float] | None = None,
         name: str = "",
+        watch: Callable[[Sequence[float]], End | None] = lambda _: None,
     ) -> Driven:
-        """Drives until the laps are done (0: no limit) or the time is up.
+        """Drives until the laps are done (0: no limit), the time is up, or ``watch`` of a true
+        state (7,) returns an end.
 
         ``max_time_s``: default as in a race, three times the racing line's time. ``x0``: start
         state (7,) instead of the start line at ``start_speed_mps``. ``name``: of the controller, in
@@ -202,7 +204,7 @@ class ClosedLoop:
         """
         if max_time_s is None:
             max_time_s = _LIMIT * self._line.lap_time_s * max(laps, 1) + _LIMIT_S
-        self._run += 1
+        self._run, self._watch = self._run + 1, watch
         plan = RunPlan(self._run, name, laps, max_time_s, True, start_speed_mps)
         request = run_request(self._track, plan)
         if x0 is not None:
@@ -246,8 +248,8 @@ class ClosedLoop:
             self._controller.weights_version,
         )
 
-    def _exchange(self, state: State, x: tuple[float, ...]) -> tuple[float, ...]:
-        """Hands the state to the controller; what it answers."""
+    def _exchange(self, state: State, x: tuple[float, ...]) -> tuple[float, ...] | End:
+        """Hands the state to the controller; what it answers, or what ends the run."""
         self._states.append(state)
         self._true_x.append(x)
         if self._log is not None:
@@ -256,7 +258,7 @@ class ClosedLoop:
         self._cycle.driver.observe(state)
         if not state.final:
             self._cycle.answer(state, self._send, self._limits(state))
-        return self._answer
+        return self._watch(x) or self._answer
 
     def _limits(self, state: State) -> Environment | None:
         """What limits the car in this cycle, as the watch of a controller process may: nothing."""

@@ -1,24 +1,27 @@
-"""Training data: a pure-pursuit drive of the car, logged as a race's drives are.
+"""Training data: pure-pursuit drives of the car, logged as a race's drives are.
 
 A racing line touches the edges of the track, and a driver that is disturbed on purpose, and slides,
-leaves it there. So the drive follows the racing line where that leaves room to the edges, and else
-a line made of it. A drive that leaves the track or spins is driven again, slower where it did;
+leaves it there. So a drive follows the racing line where that leaves room to the edges, and else
+a line made of it. It ends where it leaves the track or spins, and the next one is slower there;
 elsewhere it stays as fast, as a residual is known at the speeds only that were driven. Where that
 does not help, the line is too fast everywhere, and so it is if the fallback has to brake often,
-because the car was lost sight of.
+because the car was lost sight of. Drives that have failed are learned from as well: up to there
+they were the fastest ones.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 
-from bayesrace.arrays import Floats
+from bayesrace.arrays import Flags, Floats
 from bayesrace.controller.pure_pursuit import DrivingStyle, PurePursuit, PurePursuitSettings
 from bayesrace.controller.python_controller import PythonController
 from bayesrace.log import LogWriter
 from bayesrace.operation.closed_loop import ClosedLoop, Driven, built_in_car
+from bayesrace.plant.car import End
 from bayesrace.plant.vehicle import FmuFault, Vehicle
 from bayesrace.raceline import RaceLine, RaceLineSettings, read_raceline_for
 from bayesrace.raceline.friction import timed_line
@@ -48,12 +51,15 @@ _MOST: Final = 0.3
 """Of a track's width: the most that the line keeps from each edge."""
 _LAPS: Final = 1.5
 """Of the line, flying: the least length of a drive, which begins at rest and is slower."""
-_ESTIMATED: Final = 2.0
-"""Times that length where states are estimated."""
+_ESTIMATED: Final = 5.0
+"""Times as long as the car's file says, all drives together, where states are estimated ..."""
+_ESTIMATED_LAPS: Final = 3.0
+"""... and so many flying laps at least."""
 _WAVE: Final = 0.4
 """Amplitude of the weaving style, over the room that the line keeps ..."""
 _WAVELENGTH: Final = 32.0
 """... and its wavelength in wheelbases."""
+_FAILED: Final = End("stopped", "the car has left its track, or spins")
 _THINNED: Final = 4
 """Points of the racing line to a node of a line made of it."""
 
@@ -70,52 +76,67 @@ def collect(
     vehicle: Vehicle | None = None,
     sensors: Sensors = EXACT,
     delay_s: float = 0.0,
-) -> Driven:
-    """Drives for ``duration_s`` and logs the run at ``path``: the first that stays on the track,
-    does not spin and is driven to its end, or the last. With a ``speed_scale`` in ``settings``
-    there is but one.
+) -> list[Driven]:
+    """Drives for ``duration_s`` in all, a lap at least in the last drive, which is the first that
+    neither leaves the track nor spins; logs all drives at ``path``, as runs from the start line.
 
-    ``sensors``, ``delay_s``: as in :class:`ClosedLoop`, the seed is that of ``settings``.
+    Each is slower than the one before, to the last of ten. With a ``speed_scale`` in ``settings``
+    there is but one. ``sensors``, ``delay_s``: as in :class:`ClosedLoop`, the seed is that of
+    ``settings``.
 
-    The same settings give the same drive to the bit. ``artefact``: a controller built for the car,
+    The same settings give the same drives to the bit. ``artefact``: a controller built for the car,
     whose control cycle drives. ``vehicle``: what simulates the car; the built-in equations without.
     Raises FmuFault if it fails.
     """
     followed = training_line(track, line, car, settings.style)
-    room_m, vehicle = room_beside(track, followed), vehicle or built_in_car(car)
-    speeds, slowed = followed.vx_mps, np.ones(len(followed.vx_mps))
-    for attempt in range(1 if settings.speed_scale else _ATTEMPTS):
-        pursuit = PurePursuit(car, followed.x_m, followed.y_m, speeds, settings, room_m=room_m)
-        scale = settings.scale * float(np.mean(speeds / followed.vx_mps))
-        about = {
-            "track": track.name, "car": car_text(car),
-            "attempts": str(attempt + 1), "speed_scale": f"{scale:.3g}",
-        }  # fmt: skip
-        log = LogWriter(path, {"collect": about})
-        try:
-            loop = ClosedLoop(
-                car, track, line, PythonController(artefact, pursuit), vehicle, log,
-                sensors=sensors, seed=settings.seed, delay_s=delay_s,
-            )  # fmt: skip
-            driven = loop.drive(0, duration_s, start_speed_mps, name="pure-pursuit")
-        finally:
-            log.close()
-        if driven.end.reason == "plant_fault":
-            raise FmuFault(driven.end.text)
-        wrong = track.project_path(driven.x[:, :2]).off_track_m > 0
-        wrong |= np.abs(driven.slip_rad) > car.tuning.gate.spin_rad
-        everywhere = driven.fallbacks > _FALLBACK * len(driven.levels)
-        if not wrong.any() and not everywhere:
-            break
-        slower = np.ones(len(speeds))
-        if wrong.any():  # the first time: what comes after it may follow of it
-            at = driven.x[int(np.argmax(wrong))]
-            slower = slower_before(followed, at, car)
-            if slowed[_nearest(followed, at)] < 1:
-                everywhere, slower = True, np.ones(len(speeds))
-        slowed = slower * slowed
-        speeds = (_EVERYWHERE if everywhere else 1.0) * slower * speeds
+    room_m, speeds = room_beside(track, followed), followed.vx_mps
+
+    def pursuit() -> PurePursuit:
+        return PurePursuit(car, followed.x_m, followed.y_m, speeds, settings, room_m=room_m)
+
+    def watch(x: Sequence[float]) -> End | None:
+        return _FAILED if _failing(track, car, np.array([x]))[0] else None
+
+    least_s = min(duration_s, _lap_length_s(car, line))
+    slowed, driven = np.ones(len(speeds)), list[Driven]()
+    log = LogWriter(path, {"collect": {"track": track.name, "car": car_text(car)}})
+    try:
+        controller = PythonController(artefact, pursuit())
+        loop = ClosedLoop(
+            car, track, line, controller, vehicle or built_in_car(car), log,
+            sensors=sensors, seed=settings.seed, delay_s=delay_s,
+        )  # fmt: skip
+        for _ in range(1 if settings.speed_scale else _ATTEMPTS):
+            left_s = duration_s - sum(float(one.time_s[-1]) for one in driven)
+            one = loop.drive(
+                0, max(left_s, least_s), start_speed_mps, name="pure-pursuit", watch=watch
+            )
+            driven.append(one)
+            if one.end.reason == "plant_fault":
+                raise FmuFault(one.end.text)
+            wrong = _failing(track, car, one.x)
+            everywhere = one.fallbacks > _FALLBACK * len(one.levels)
+            if not wrong.any() and not everywhere:
+                break
+            slower = np.ones(len(speeds))
+            if wrong.any():
+                at = one.x[int(np.argmax(wrong))]
+                slower = slower_before(followed, at, car)
+                if slowed[_nearest(followed, at)] < 1:
+                    everywhere, slower = True, np.ones(len(speeds))
+            slowed = slower * slowed
+            speeds = (_EVERYWHERE if everywhere else 1.0) * slower * speeds
+            controller.law = pursuit()
+    finally:
+        log.close()
     return driven
+
+
+def _failing(track: Track, car: CarParameters, x: Floats) -> Flags:
+    """Which of the states (n, 7) are off the track, or those of a spin."""
+    moving = np.hypot(x[:, 3], x[:, 4]) > car.tuning.gate.moving_mps
+    spinning = np.abs(np.arctan2(x[:, 4], x[:, 3])) > car.tuning.gate.spin_rad
+    return np.asarray((track.project_path(x[:, :2]).off_track_m > 0) | (moving & spinning))
 
 
 def _nearest(line: RaceLine, x: Floats) -> int:
@@ -166,10 +187,16 @@ def training_margin_m(track: Track, car: CarParameters, margin_m: float | None =
 
 
 def drive_length_s(car: CarParameters, line: RaceLine, sensors: Sensors = EXACT) -> float:
-    """Length of a training drive along a line, by default: a lap at least; longer where states are
+    """Length of training drives along a line, by default: a lap at least; longer where states are
     estimated, as such a sample says less."""
-    length_s = max(car.tuning.pursuit.drive_s, _LAPS * line.lap_time_s)
-    return _ESTIMATED * length_s if sensors.root else length_s
+    if not sensors.root:
+        return _lap_length_s(car, line)
+    return max(_ESTIMATED * car.tuning.pursuit.drive_s, _ESTIMATED_LAPS * line.lap_time_s)
+
+
+def _lap_length_s(car: CarParameters, line: RaceLine) -> float:
+    """Length of a drive that passes all of a line."""
+    return max(car.tuning.pursuit.drive_s, _LAPS * line.lap_time_s)
 
 
 def training_line(

@@ -242,8 +242,8 @@ def drive_for_training(
     car: CarParameters,
     artefact: Path,
     log: Path,
-) -> Driven:
-    """The pure-pursuit drive of the car that the settings simulate, logged.
+) -> list[Driven]:
+    """The pure-pursuit drives of the car that the settings simulate, logged.
 
     ``artefact``: a controller built for the car, whose control cycle drives.
     Raises InputError for an FMU or map that cannot be used, FmuFault if the FMU fails.

@@ -18,7 +18,7 @@ from bayesrace.codegen.build import build
 from bayesrace.codegen.settings import BuildSettings
 from bayesrace.controller import pure_pursuit
 from bayesrace.controller.pure_pursuit import DrivingStyle, PurePursuitSettings
-from bayesrace.log import LogReader
+from bayesrace.learning.sources import read_samples
 from bayesrace.operation.closed_loop import Driven, built_in_car
 from bayesrace.operation.collect import (
     collect,
@@ -62,7 +62,7 @@ def driven(tmp_path_factory: pytest.TempPathFactory) -> dict[DrivingStyle, tuple
     for style in styles:
         log, settings = folder / f"{style}.mcap", PurePursuitSettings(style=style)
         arguments = TRACK, at_the_edge(), CAR, artefact, log, 12.0, settings
-        found[style] = collect(*arguments, vehicle=built_in_car(CAR)), log
+        found[style] = collect(*arguments, vehicle=built_in_car(CAR))[-1], log
     return found
 
 
@@ -81,16 +81,41 @@ def test_the_drive_stays_on_the_track_in_each_style_and_excites_the_car(
     assert slip["weave"] > slip["calm"]
 
 
-def test_a_drive_that_leaves_the_track_is_driven_again_slower(
+def test_a_drive_that_leaves_the_track_ends_and_the_next_one_is_slower(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """All of them are learned from, and the last one lasts a lap."""
     artefact, log = build(BuildSettings(car=CAR))[0], tmp_path / "drive.mcap"
-    course = TRACK, at_the_edge(), CAR, artefact, log, 6.0
+    course = TRACK, at_the_edge(), CAR, artefact, log, 24.0
     monkeypatch.setitem(pure_pursuit._SCALES, "limit", 1.6)
     settings = PurePursuitSettings(), PurePursuitSettings(speed_scale=1.6)
-    kept, once = (collect(*course, one, vehicle=built_in_car(CAR)) for one in settings)
-    assert off_track_m(kept).max() <= 0
-    assert off_track_m(once).max() > 0, "a scale that is asked for is driven once"
+    drives, once = (collect(*course, one, vehicle=built_in_car(CAR)) for one in settings)
+    *failed, last = drives
+    for one in failed:
+        assert one.end.reason == "stopped"
+        assert off_track_m(one)[-1] > 0 or abs(one.slip_rad[-1]) > CAR.tuning.gate.spin_rad
+        assert off_track_m(one)[:-1].max() <= 0
+    assert off_track_m(last).max() <= 0
+    took_s = [float(one.time_s[-1]) for one in drives]
+    assert took_s[-1] == pytest.approx(max(24.0 - sum(took_s[:-1]), 12.0))
+    assert len(once) == 1, "a scale that is asked for is driven once"
+    collect(*course, settings[0], vehicle=built_in_car(CAR))
+    learned = read_samples([log]).dataset
+    assert 0 <= sum(len(one.u) for one in drives) - len(learned) < 10 * len(drives)
+
+
+def scripted(
+    drives: list[Driven], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> tuple[list[Driven], list[Floats]]:
+    """What is collected where these are driven, and the speeds at which they were to be."""
+    left, speeds = list(drives), list[Floats]()
+    module = "bayesrace.operation.collect."
+    loop = SimpleNamespace(drive=lambda *_, **__: left.pop(0))
+    monkeypatch.setattr(module + "ClosedLoop", lambda *_, **__: loop)
+    monkeypatch.setattr(module + "PythonController", lambda *_: SimpleNamespace())
+    monkeypatch.setattr(module + "PurePursuit", lambda *given, **_: speeds.append(given[3]))
+    course, log = (TRACK, at_the_edge(), CAR, tmp_path), tmp_path / "drive.mcap"
+    return collect(*course, log, 12.0, PurePursuitSettings()), speeds
 
 
 def test_a_drive_in_which_the_car_is_lost_sight_of_is_driven_again_slower(
@@ -98,16 +123,9 @@ def test_a_drive_in_which_the_car_is_lost_sight_of_is_driven_again_slower(
 ) -> None:
     whole, _ = driven["calm"]
     blind = replace(whole, levels=np.where(np.arange(len(whole.levels)) > 500, 3, 0))
-    drives, log = [blind, whole], tmp_path / "drive.mcap"
-    monkeypatch.setattr(
-        "bayesrace.operation.collect.ClosedLoop",
-        lambda *_, **__: SimpleNamespace(drive=lambda *_, **__: drives.pop(0)),
-    )
-    monkeypatch.setattr("bayesrace.operation.collect.PythonController", lambda *_: None)
-    assert collect(TRACK, at_the_edge(), CAR, tmp_path, log, 12.0, PurePursuitSettings()) is whole
-    about = LogReader(log).metadata()["collect"]
-    assert about["attempts"] == "2"
-    assert 0.85 < float(about["speed_scale"]) / pure_pursuit._SCALES["limit"] < 1
+    found, speeds = scripted([blind, whole], tmp_path, monkeypatch)
+    assert found == [blind, whole]
+    np.testing.assert_allclose(speeds[1] / speeds[0], 0.93)
 
 
 def test_a_drive_that_fails_where_it_was_slower_is_slower_everywhere(
@@ -115,23 +133,14 @@ def test_a_drive_that_fails_where_it_was_slower_is_slower_everywhere(
 ) -> None:
     """Three drives that spin: the second one where the first did, the third one elsewhere."""
     whole, _ = driven["calm"]
-    drives, speeds = [], list[Floats]()
+    drives = list[Driven]()
     for row in (150, 150, 300):
         x = whole.x.copy()
         x[row, 4] = 5 * x[row, 3]
         drives.append(replace(whole, true_x=[tuple(one) for one in x]))
     drives.append(whole)
-
-    monkeypatch.setattr(
-        "bayesrace.operation.collect.PurePursuit", lambda *given, **_: speeds.append(given[3])
-    )
-    monkeypatch.setattr(
-        "bayesrace.operation.collect.ClosedLoop",
-        lambda *_, **__: SimpleNamespace(drive=lambda *_, **__: drives.pop(0)),
-    )
-    monkeypatch.setattr("bayesrace.operation.collect.PythonController", lambda *_: None)
-    log, settings = tmp_path / "drive.mcap", PurePursuitSettings()
-    assert collect(TRACK, at_the_edge(), CAR, tmp_path, log, 12.0, settings) is whole
+    found, speeds = scripted(drives, tmp_path, monkeypatch)
+    assert found == drives
     first, again, elsewhere = (b / a for a, b in pairwise(speeds))
     assert (first.min(), first.max()) == (pytest.approx(0.85), 1.0)
     np.testing.assert_allclose(again, 0.93)
@@ -151,9 +160,9 @@ def test_a_drive_is_slower_only_where_something_went_wrong() -> None:
     assert np.abs(np.diff(np.append(share, share[0]))).max() < 0.03
 
 
-def test_a_drive_of_estimated_states_lasts_twice_as_long() -> None:
+def test_drives_of_estimated_states_last_longer() -> None:
     estimated = drive_length_s(CAR, at_the_edge(), get_sensors("mocap"))
-    assert estimated == 2 * drive_length_s(CAR, at_the_edge())
+    assert estimated == 5 * CAR.tuning.pursuit.drive_s
 
 
 def test_a_line_with_room_is_followed_as_it_is() -> None:
@@ -185,7 +194,7 @@ def test_collect_says_how_the_drive_went(tmp_path: Path, cli: Cli) -> None:
     options = ("--track", "paddock", "--raceline", "line.csv", "--duration", "2")
     done = cli("collect", *options, "--style", "calm")
     assert done.code == 0, done.err
-    assert "100 samples, 0 of them off the track, up to " in done.out
+    assert "1 drive, 100 samples, 0 of them off the track, up to " in done.out
 
 
 def test_a_race_reports_its_training_drive(

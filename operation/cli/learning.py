@@ -45,6 +45,8 @@ def collect(
     out: Path = options.out_file(Path("collect.mcap")),
 ) -> None:
     """Drive a track by pure pursuit and log the drive as training data."""
+    import numpy as np
+
     from bayesrace.codegen.build import build
     from bayesrace.codegen.settings import BuildSettings
     from bayesrace.operation.preparation import drive_for_training
@@ -57,10 +59,11 @@ def collect(
     line = read_raceline_for(raceline, course, car)
     artefact, _ = build(BuildSettings(car=car))
     driven = drive_for_training(chosen, course, line, car, artefact, out)
-    off_track_m = course.project_path(driven.x[:, :2]).off_track_m
+    x = np.concatenate([one.x[:-1] for one in driven])
+    off_track = course.project_path(x[:, :2]).off_track_m > 0
     typer.echo(
-        f"{len(driven.u)} samples, {int((off_track_m > 0).sum())} of them off the track, "
-        f"up to {float(driven.x[:, 3].max()):.2f} m/s: {out}"
+        f"{len(driven)} {'drive' if len(driven) == 1 else 'drives'}, {len(x)} samples, "
+        f"{int(off_track.sum())} of them off the track, up to {float(x[:, 3].max()):.2f} m/s: {out}"
     )
 
 

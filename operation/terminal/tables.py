@@ -203,8 +203,10 @@ def drive_text(drive: LapResult) -> str:
     off = f"{drive.off_track_samples or 'none'} of {drive.samples} samples off the track"
     if drive.off_track_samples:
         off += f" by up to {_metres(drive.off_track_max_m)} m"
+    faster = drive.run - 1
+    before = f"after {faster} faster {'drives' if faster > 1 else 'drive'}, " if faster else ""
     return (
-        f"{f'laps {laps} s' if laps else 'no lap'}, {off}, "
+        f"{before}{f'laps {laps} s' if laps else 'no lap'}, {off}, "
         f"up to {_decimals(drive.speed_max_mps, 2)} m/s and {_slip(drive)}° of slip"
     )
 

@@ -1,0 +1,308 @@
+"""Weights conditioned on what instruments have read, in place of smoothed states.
+
+Smoothed states err alike from one sample to the next, and what they err by depends on the model
+that smoothed them: a GP that is trained on them has this error in its mean, however many there are.
+So the last step of learning takes the readings themselves. A correction is a sum of basis
+functions, with weights w that are normally distributed a priori,
+
+    g(z) = m + phi(z)' w,    phi(z) = s L^-1 k(Z, z),    L L' = k(Z, Z),    w ~ N(0, I)
+
+which is the GP on the subspace of M of its samples, Z (Seeger, Williams and Lawrence, "Fast forward
+selection to speed up sparse Gaussian process regression", AISTATS 2003); what it lacks there,
+s^2 k(z, z) - phi' phi, is independent noise in each step (Snelson and Ghahramani, "Sparse Gaussian
+processes using pseudo-inputs", NIPS 2006), besides the learned noise. The corrected model is linear
+in w, so an extended Kalman filter of [x; w], linearised along smoothed states, has the posterior of
+w by all readings when it has passed all drives: w goes on from one to the next, x begins anew.
+Samples that are at hand without readings are measurements of g.
+
+Where a car is its own mirror image, so is the correction: k(z, z') + p k(z, Mz') in place of k, with
+p = 1 for vx and -1 for vy and omega, which change their signs in the mirror M.
+
+Weights have room for points, not for a covariance: they get the Z (with their images), the exact
+mean, and the noise with which points there would leave as large a variance, on average over the
+samples.
+"""
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+from scipy.linalg import cholesky, solve_triangular
+from scipy.optimize import brentq
+
+from bayesrace.arrays import Floats
+from bayesrace.gp.expression import evaluate_mean, kernel_matrix
+from bayesrace.gp.weights import FEATURES, GpOutput, GpWeights
+from bayesrace.integrators import Discretisation
+from bayesrace.learning.dataset import MIRRORED_FEATURES, MIRRORED_OUTPUTS, Dataset
+from bayesrace.learning.drives import Drive, Measured
+from bayesrace.learning.smoothing import (
+    EXCEEDED,
+    REFUSED,
+    begins,
+    blurred,
+    corrected_steps,
+    innovation,
+    inputs_of,
+    observation,
+    started,
+)
+from bayesrace.learning.subset import evenly, most_informative
+from bayesrace.learning.validation import residual
+from bayesrace.vehicles.parameters import CarParameters
+
+__all__ = ["conditioned"]
+
+_BASIS: Final = 150
+"""Functions of an output at most. Time grows with the square; 200 are no better."""
+_RATIO: Final = 0.01
+"""Noise over signal with which the most informative samples are chosen: those that a basis lacks."""
+_ROUNDING: Final = 1e-6
+"""Of the mean variance, for the factor of Z that are nearly alike."""
+_COMPARED: Final = 400
+"""Samples that variances are compared at."""
+_NX: Final = 7
+_NB: Final = 9
+_LATER: Final = 48
+"""Rows of corrections that are collected before the covariance of w is made anew."""
+
+
+def conditioned(
+    weights: GpWeights,
+    dataset: Dataset,
+    discretisation: Discretisation,
+    capacity: int,
+    noise_share: float,
+) -> GpWeights:
+    """The same kernels, with the mean and the variance that the readings of the drives leave, and
+    the samples without drives.
+
+    ``dataset`` was smoothed by nearly these ``weights``. ``capacity``: points of an output at most.
+    ``noise_share``: of the variance of their noise, what is the model's. LinAlgError where they
+    cannot follow the readings.
+    """
+    images = 2 if dataset.car.mirrored_samples else 1
+    count, z = max(1, min(_BASIS, capacity // images)), dataset.features
+    bases = [
+        _Basis.of(output, z, count, parity if images == 2 else 0)
+        for output, parity in zip(weights.outputs, MIRRORED_OUTPUTS, strict=True)
+    ]
+    belief = _Belief(bases, noise_share)
+    estimates = dataset.estimates
+    drives = () if estimates is None else estimates.drives
+    settled = np.ones(len(dataset), bool) if estimates is None else estimates.origin[:, 0] < 0
+    if settled.any():
+        samples = dataset.select(settled)
+        belief.measure(samples.features, residual(samples, discretisation), samples.deviation)
+    for drive in drives:
+        belief.follow(drive, dataset.car, discretisation, weights)
+    mean, covariance = belief.result()
+    some = z[evenly(len(z), _COMPARED)]
+    outputs = [
+        basis.output(mean[own], basis.variance(some, covariance[own, own]), some)
+        for basis, own in zip(bases, belief.parts, strict=True)
+    ]
+    return replace(weights, outputs=(outputs[0], outputs[1], outputs[2]))
+
+
+@dataclass(frozen=True, eq=False)
+class _Basis:
+    """phi of an output, in SI units."""
+
+    before: GpOutput
+    inputs: Floats
+    """Z, (M, 6)"""
+    parity: float
+    """p; 0 for a car that is not symmetric."""
+    factor: Floats
+    """L, (M, M)"""
+
+    @classmethod
+    def of(cls, before: GpOutput, z: Floats, count: int, parity: float) -> "_Basis":
+        """At ``count`` of the samples ``z`` (n, 6)."""
+        rows = most_informative(before.kernel, z, before.length_scales, _RATIO, count)
+        basis = cls(before, z[rows], parity, np.eye(len(rows)))
+        matrix = basis.between(basis.inputs, basis.inputs)
+        matrix[np.diag_indices_from(matrix)] += _ROUNDING * np.trace(matrix) / len(matrix)
+        return replace(basis, factor=cholesky(matrix, lower=True))
+
+    @property
+    def scale(self) -> float:
+        """s"""
+        return float(self.before.y_scale * np.sqrt(self.before.signal_variance))
+
+    @property
+    def offset(self) -> float:
+        """m; what is odd in the mirror has none."""
+        return self.before.y_mean if self.parity >= 0 else 0.0
+
+    def between(self, a: Floats, b: Floats) -> Floats:
+        """Correlations (n, m) of g at ``a`` (n, 6) and ``b`` (m, 6)."""
+        kind, lengths = self.before.kernel, self.before.length_scales
+        found = kernel_matrix(kind, a, b, lengths)
+        if self.parity:
+            found += self.parity * kernel_matrix(kind, a, b * MIRRORED_FEATURES, lengths)
+        return found
+
+    def at(self, z: Floats) -> Floats:
+        """phi (n, M)."""
+        across = self.between(self.inputs, z)
+        return self.scale * solve_triangular(self.factor, across, lower=True).T
+
+    def lacking(self, z: Floats, phi: Floats) -> Floats:
+        """Prior variance (n,) that phi does not have."""
+        own = np.ones(len(z))
+        if self.parity:
+            apart = z * (1 - MIRRORED_FEATURES) / self.before.length_scales
+            # The kernel of one point with its own image: a row each.
+            zero, ones = np.zeros((1, len(FEATURES))), np.ones(len(FEATURES))
+            own += self.parity * kernel_matrix(self.before.kernel, apart, zero, ones)[:, 0]
+        return np.maximum(self.scale**2 * own - np.sum(phi**2, axis=1), 0)
+
+    def variance(self, z: Floats, covariance: Floats) -> Floats:
+        """Of g at ``z``, (n,), where w has this covariance (M, M)."""
+        phi = self.at(z)
+        return np.einsum("ni,ij,nj->n", phi, covariance, phi) + self.lacking(z, phi)
+
+    def output(self, w: Floats, variance: Floats, z: Floats) -> GpOutput:
+        """Weights with the mean of ``w`` (M,), and such ``variance`` (n,) on average at ``z``."""
+        before, scale = self.before, self.before.y_scale * self.before.signal_variance
+        alpha = solve_triangular(self.factor, w, trans=1, lower=True) * self.scale / scale
+        inputs = self.inputs
+        if self.parity:
+            inputs = np.vstack([inputs, inputs * MIRRORED_FEATURES])
+            alpha = np.concatenate([alpha, self.parity * alpha])
+        wanted = float(np.mean(variance)) / self.scale**2
+        noise = self.before.signal_variance * _noise_for(before, inputs, z, wanted)
+        return replace(
+            before, inputs=inputs, alpha=alpha, y_mean=self.offset, noise_variance=noise
+        )
+
+
+def _noise_for(output: GpOutput, inputs: Floats, z: Floats, wanted: float) -> float:
+    """Noise over signal of points at ``inputs``, with which the mean variance over the signal's at
+    ``z`` is as wanted."""
+    kind, lengths = output.kernel, output.length_scales
+    values, vectors = np.linalg.eigh(kernel_matrix(kind, inputs, inputs, lengths))
+    squares = (kernel_matrix(kind, z, inputs, lengths) @ vectors) ** 2
+    values = np.maximum(values, 0)
+
+    def excess(log_noise: float) -> float:
+        left = 1 - squares @ (1 / (values + np.exp(log_noise)))
+        return float(np.log(np.maximum(np.mean(left), 1e-14) / wanted))
+
+    least, most = np.log([1e-9, 1e3])
+    if excess(least) > 0:
+        return float(np.exp(least))
+    return float(np.exp(brentq(excess, least, most, xtol=1e-3) if excess(most) > 0 else most))
+
+
+class _Belief:
+    """Mean and covariance of [x; w]."""
+
+    def __init__(self, bases: Sequence[_Basis], noise_share: float) -> None:
+        ends = np.cumsum([0, *(len(one.inputs) for one in bases)])
+        self.parts = [slice(*pair) for pair in zip(ends, ends[1:], strict=False)]
+        self._bases, count = bases, int(ends[-1])
+        self._noise = noise_share * np.array([one.before.amplitudes[3] for one in bases])
+        self._w, self._ww = np.zeros(count), np.eye(count)
+        self._x, self._xx, self._xw = np.zeros(_NB), np.zeros((_NB, _NB)), np.zeros((_NB, count))
+        self._later: list[Floats] = []
+        """Rows R of which R' R is still to be taken from the covariance of w."""
+
+    def result(self) -> tuple[Floats, Floats]:
+        """Mean (m,) and covariance (m, m) of w."""
+        self._settle()
+        return self._w, self._ww
+
+    def measure(self, z: Floats, g: Floats, deviation: Floats) -> None:
+        """Values ``g`` (n, 3) at ``z`` (n, 6), as well known as ``deviation`` (n, 3 or more) says;
+        before any drive."""
+        for k, (basis, own) in enumerate(zip(self._bases, self.parts, strict=True)):
+            phi = basis.at(z)
+            variance = deviation[:, k] ** 2 + self._noise[k] + basis.lacking(z, phi)
+            weighted = phi / variance[:, None]
+            covariance = np.linalg.inv(np.eye(phi.shape[1]) + weighted.T @ phi)
+            self._ww[own, own] = covariance
+            self._w[own] = covariance @ (weighted.T @ (g[:, k] - basis.offset))
+
+    def follow(
+        self, drive: Drive, car: CarParameters, discretisation: Discretisation, weights: GpWeights
+    ) -> None:
+        """Takes in all readings of a drive, linearised along its path and ``weights``."""
+        events, path = drive.events, drive.path
+        if path is None:
+            return
+        path = path[:, :_NB]
+        self._x, self._xx = started(events[0], drive, car, path[0])
+        self._xw[:] = 0
+        self._refused = Counter[str]()
+        columns = inputs_of(events[1:])
+        u, h = columns[0].T, columns[1][0]
+        start = begins(events, path)
+        step = corrected_steps(path[:-1, :_NX], start, u, h, car, discretisation, weights)
+        z, share = np.column_stack([start[:, 3:], u]), h / discretisation.step_s
+        phi = [basis.at(z) for basis in self._bases]
+        lacking = [basis.lacking(z, one) for basis, one in zip(self._bases, phi, strict=True)]
+        spread = np.sqrt((np.column_stack(lacking) + self._noise) * share[:, None])
+        noise = np.zeros((len(z), _NB, _NB))
+        spread = step.by_error * spread[:, None]
+        noise[:, :_NX, :_NX] = spread @ spread.transpose(0, 2, 1)
+        noise += np.diag(np.square(car.tuning.estimation(nominal=False)["drift"])) * h[:, None, None]
+        slope, by_g = np.tile(np.eye(_NB), (len(z), 1, 1)), np.zeros((len(z), _NB, 3))
+        slope[:, :_NX, :_NX], by_g[:, :_NX] = step.slope, step.by_error * share[:, None, None]
+        after, assumed = path[:-1].copy(), evaluate_mean(weights, z)
+        after[:, :_NX] = step.ahead
+        read = blurred(events, path, discretisation.step_s, weights)
+        for i, event in enumerate(read[1:]):
+            if event.duration_s > 0:
+                self._x = after[i] + slope[i] @ (self._x - path[i])
+                self._predict(slope[i], by_g[i], noise[i], [one[i] for one in phi], assumed[i])
+            if event.measured is not None:
+                self._update(event.measured, car.tuning.estimator.gate)
+
+    def _predict(
+        self, slope: Floats, by_g: Floats, noise: Floats, phi: Sequence[Floats], assumed: Floats
+    ) -> None:
+        """The covariance of a step, and the mean that it has by w in place of what was assumed."""
+        own = list(zip(phi, self.parts, strict=True))
+        offsets = [basis.offset for basis in self._bases]
+        g = np.array([one @ self._w[part] for one, part in own]) + offsets
+        gw = np.array([one @ self._ww[part] for one, part in own])
+        if self._later:
+            rows = np.vstack(self._later)
+            gw -= np.array([rows[:, part] @ one for one, part in own]) @ rows
+        gx = np.array([self._xw[:, part] @ one for one, part in own])
+        gg = np.array([gw[:, part] @ one for one, part in own])
+        across = slope @ gx.T @ by_g.T
+        self._x += by_g @ (g - assumed)
+        self._xx = slope @ self._xx @ slope.T + across + across.T + by_g @ gg @ by_g.T + noise
+        self._xx = (self._xx + self._xx.T) / 2
+        self._xw = slope @ self._xw + by_g @ gw
+
+    def _update(self, measured: Measured, gate: float) -> None:
+        """By a reading, where the gate lets it pass, or has refused too many of its instrument."""
+        h = observation(measured.states, _NB)
+        factor = np.linalg.cholesky(h @ self._xx @ h.T + np.diag(measured.variance))
+        white = np.linalg.solve(factor, innovation(measured, self._x[None], h)[0])
+        refused = self._refused[measured.instrument]
+        passed = gate <= 0 or white @ white <= gate * EXCEEDED[len(h)]
+        self._refused[measured.instrument] = 0 if passed else refused + 1
+        if not passed and refused < REFUSED:
+            return
+        by_x, by_w = (np.linalg.solve(factor, h @ one) for one in (self._xx, self._xw))
+        self._x += by_x.T @ white
+        self._w += by_w.T @ white
+        self._xx -= by_x.T @ by_x
+        self._xw -= by_x.T @ by_w
+        self._later.append(by_w)
+        if sum(map(len, self._later)) >= _LATER:
+            self._settle()
+
+    def _settle(self) -> None:
+        if self._later:
+            rows = np.vstack(self._later)
+            self._ww -= rows.T @ rows
+            self._later.clear()
