@@ -15,18 +15,18 @@ in w, so an extended Kalman filter of [x; w], linearised along smoothed states, 
 w by all readings when it has passed all drives: w goes on from one to the next, x begins anew.
 Samples that are at hand without readings are measurements of g.
 
-Where a car is its own mirror image, so is the correction: k(z, z') + p k(z, Mz') in place of k, with
-p = 1 for vx and -1 for vy and omega, which change their signs in the mirror M.
+Where a car is its own mirror image, so is the correction: k(z, z') + p k(z, Mz') in place of k,
+with p = 1 for vx and -1 for vy and omega, which change their signs in the mirror M.
 
 Weights have room for points, not for a covariance: they get the Z (with their images), the exact
 mean, and the noise with which points there would leave as large a variance, on average over the
 samples.
 """
 
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Final
+from itertools import pairwise
+from typing import Final, NamedTuple
 
 import numpy as np
 from scipy.linalg import cholesky, solve_triangular
@@ -37,10 +37,8 @@ from bayesrace.gp.expression import evaluate_mean, kernel_matrix
 from bayesrace.gp.weights import FEATURES, GpOutput, GpWeights
 from bayesrace.integrators import Discretisation
 from bayesrace.learning.dataset import MIRRORED_FEATURES, MIRRORED_OUTPUTS, Dataset
-from bayesrace.learning.drives import Drive, Measured
+from bayesrace.learning.drives import Drive, Event, Measured
 from bayesrace.learning.smoothing import (
-    EXCEEDED,
-    REFUSED,
     begins,
     blurred,
     corrected_steps,
@@ -56,9 +54,9 @@ from bayesrace.vehicles.parameters import CarParameters
 __all__ = ["conditioned"]
 
 _BASIS: Final = 150
-"""Functions of an output at most. Time grows with the square; 200 are no better."""
+"""Functions of an output at most. Time and memory grow with their square."""
 _RATIO: Final = 0.01
-"""Noise over signal with which the most informative samples are chosen: those that a basis lacks."""
+"""Noise over signal with which the most informative samples are chosen."""
 _ROUNDING: Final = 1e-6
 """Of the mean variance, for the factor of Z that are nearly alike."""
 _COMPARED: Final = 400
@@ -149,7 +147,7 @@ class _Basis:
     def at(self, z: Floats) -> Floats:
         """phi (n, M)."""
         across = self.between(self.inputs, z)
-        return self.scale * solve_triangular(self.factor, across, lower=True).T
+        return np.asarray(self.scale * solve_triangular(self.factor, across, lower=True).T)
 
     def lacking(self, z: Floats, phi: Floats) -> Floats:
         """Prior variance (n,) that phi does not have."""
@@ -159,12 +157,12 @@ class _Basis:
             # The kernel of one point with its own image: a row each.
             zero, ones = np.zeros((1, len(FEATURES))), np.ones(len(FEATURES))
             own += self.parity * kernel_matrix(self.before.kernel, apart, zero, ones)[:, 0]
-        return np.maximum(self.scale**2 * own - np.sum(phi**2, axis=1), 0)
+        return np.asarray(np.maximum(self.scale**2 * own - np.sum(phi**2, axis=1), 0))
 
     def variance(self, z: Floats, covariance: Floats) -> Floats:
         """Of g at ``z``, (n,), where w has this covariance (M, M)."""
         phi = self.at(z)
-        return np.einsum("ni,ij,nj->n", phi, covariance, phi) + self.lacking(z, phi)
+        return np.asarray(np.sum(phi @ covariance * phi, axis=1) + self.lacking(z, phi))
 
     def output(self, w: Floats, variance: Floats, z: Floats) -> GpOutput:
         """Weights with the mean of ``w`` (M,), and such ``variance`` (n,) on average at ``z``."""
@@ -176,9 +174,7 @@ class _Basis:
             alpha = np.concatenate([alpha, self.parity * alpha])
         wanted = float(np.mean(variance)) / self.scale**2
         noise = self.before.signal_variance * _noise_for(before, inputs, z, wanted)
-        return replace(
-            before, inputs=inputs, alpha=alpha, y_mean=self.offset, noise_variance=noise
-        )
+        return replace(before, inputs=inputs, alpha=alpha, y_mean=self.offset, noise_variance=noise)
 
 
 def _noise_for(output: GpOutput, inputs: Floats, z: Floats, wanted: float) -> float:
@@ -199,12 +195,29 @@ def _noise_for(output: GpOutput, inputs: Floats, z: Floats, wanted: float) -> fl
     return float(np.exp(brentq(excess, least, most, xtol=1e-3) if excess(most) > 0 else most))
 
 
+class _Chain(NamedTuple):
+    """The steps from each event to the next, linearised along a path."""
+
+    ahead: Floats
+    """(n, 9), from the path."""
+    slope: Floats
+    """(n, 9, 9), by the states."""
+    by_g: Floats
+    """(n, 9, 3), by the corrections of the period."""
+    noise: Floats
+    """(n, 9, 9)"""
+    phi: Sequence[Floats]
+    """(n, M) of each output."""
+    assumed: Floats
+    """Corrections (n, 3) that ``ahead`` was made with."""
+
+
 class _Belief:
     """Mean and covariance of [x; w]."""
 
     def __init__(self, bases: Sequence[_Basis], noise_share: float) -> None:
         ends = np.cumsum([0, *(len(one.inputs) for one in bases)])
-        self.parts = [slice(*pair) for pair in zip(ends, ends[1:], strict=False)]
+        self.parts = [slice(*pair) for pair in pairwise(ends.tolist())]
         self._bases, count = bases, int(ends[-1])
         self._noise = noise_share * np.array([one.before.amplitudes[3] for one in bases])
         self._w, self._ww = np.zeros(count), np.eye(count)
@@ -236,62 +249,65 @@ class _Belief:
         if path is None:
             return
         path = path[:, :_NB]
+        chain = self._chain(events, path, car, discretisation, weights)
         self._x, self._xx = started(events[0], drive, car, path[0])
         self._xw[:] = 0
-        self._refused = Counter[str]()
-        columns = inputs_of(events[1:])
-        u, h = columns[0].T, columns[1][0]
-        start = begins(events, path)
-        step = corrected_steps(path[:-1, :_NX], start, u, h, car, discretisation, weights)
-        z, share = np.column_stack([start[:, 3:], u]), h / discretisation.step_s
-        phi = [basis.at(z) for basis in self._bases]
-        lacking = [basis.lacking(z, one) for basis, one in zip(self._bases, phi, strict=True)]
-        spread = np.sqrt((np.column_stack(lacking) + self._noise) * share[:, None])
-        noise = np.zeros((len(z), _NB, _NB))
-        spread = step.by_error * spread[:, None]
-        noise[:, :_NX, :_NX] = spread @ spread.transpose(0, 2, 1)
-        noise += np.diag(np.square(car.tuning.estimation(nominal=False)["drift"])) * h[:, None, None]
-        slope, by_g = np.tile(np.eye(_NB), (len(z), 1, 1)), np.zeros((len(z), _NB, 3))
-        slope[:, :_NX, :_NX], by_g[:, :_NX] = step.slope, step.by_error * share[:, None, None]
-        after, assumed = path[:-1].copy(), evaluate_mean(weights, z)
-        after[:, :_NX] = step.ahead
         read = blurred(events, path, discretisation.step_s, weights)
         for i, event in enumerate(read[1:]):
             if event.duration_s > 0:
-                self._x = after[i] + slope[i] @ (self._x - path[i])
-                self._predict(slope[i], by_g[i], noise[i], [one[i] for one in phi], assumed[i])
+                self._x = chain.ahead[i] + chain.slope[i] @ (self._x - path[i])
+                self._predict(chain, i)
             if event.measured is not None:
-                self._update(event.measured, car.tuning.estimator.gate)
+                self._update(event.measured)
 
-    def _predict(
-        self, slope: Floats, by_g: Floats, noise: Floats, phi: Sequence[Floats], assumed: Floats
-    ) -> None:
-        """The covariance of a step, and the mean that it has by w in place of what was assumed."""
-        own = list(zip(phi, self.parts, strict=True))
+    def _chain(
+        self,
+        events: Sequence[Event],
+        path: Floats,
+        car: CarParameters,
+        discretisation: Discretisation,
+        weights: GpWeights,
+    ) -> "_Chain":
+        columns, begin = inputs_of(events[1:]), begins(events, path)
+        u, h = columns[0].T, columns[1][0]
+        step = corrected_steps(path[:-1, :_NX], begin, u, h, car, discretisation, weights)
+        z, share = np.column_stack([begin[:, 3:], u]), h / discretisation.step_s
+        phi = [basis.at(z) for basis in self._bases]
+        lacking = [basis.lacking(z, one) for basis, one in zip(self._bases, phi, strict=True)]
+        spread = np.sqrt((np.column_stack(lacking) + self._noise) * share[:, None])
+        spread = step.by_error * spread[:, None]
+        drift = np.square(car.tuning.estimation(nominal=False)["drift"])
+        noise = np.diag(drift) * h[:, None, None]
+        noise[:, :_NX, :_NX] += spread @ spread.transpose(0, 2, 1)
+        slope, by_g = np.tile(np.eye(_NB), (len(z), 1, 1)), np.zeros((len(z), _NB, 3))
+        slope[:, :_NX, :_NX], by_g[:, :_NX] = step.slope, step.by_error * share[:, None, None]
+        ahead = path[:-1].copy()
+        ahead[:, :_NX] = step.ahead
+        return _Chain(ahead, slope, by_g, noise, phi, evaluate_mean(weights, z))
+
+    def _predict(self, chain: "_Chain", i: int) -> None:
+        """The covariance after a step, and the mean by w in place of what was assumed."""
+        slope, by_g = chain.slope[i], chain.by_g[i]
+        pairs = [(phi[i], part) for phi, part in zip(chain.phi, self.parts, strict=True)]
         offsets = [basis.offset for basis in self._bases]
-        g = np.array([one @ self._w[part] for one, part in own]) + offsets
-        gw = np.array([one @ self._ww[part] for one, part in own])
+        g = np.array([one @ self._w[part] for one, part in pairs]) + offsets
+        gw = np.array([one @ self._ww[part] for one, part in pairs])
         if self._later:
             rows = np.vstack(self._later)
-            gw -= np.array([rows[:, part] @ one for one, part in own]) @ rows
-        gx = np.array([self._xw[:, part] @ one for one, part in own])
-        gg = np.array([gw[:, part] @ one for one, part in own])
+            gw -= np.array([rows[:, part] @ one for one, part in pairs]) @ rows
+        gx = np.array([self._xw[:, part] @ one for one, part in pairs])
+        gg = np.array([gw[:, part] @ one for one, part in pairs])
         across = slope @ gx.T @ by_g.T
-        self._x += by_g @ (g - assumed)
-        self._xx = slope @ self._xx @ slope.T + across + across.T + by_g @ gg @ by_g.T + noise
-        self._xx = (self._xx + self._xx.T) / 2
+        self._x += by_g @ (g - chain.assumed[i])
+        self._xx = slope @ self._xx @ slope.T + across + across.T + by_g @ gg @ by_g.T
+        self._xx = (self._xx + self._xx.T) / 2 + chain.noise[i]
         self._xw = slope @ self._xw + by_g @ gw
 
-    def _update(self, measured: Measured, gate: float) -> None:
-        """By a reading, where the gate lets it pass, or has refused too many of its instrument."""
+    def _update(self, measured: Measured) -> None:
+        """By a reading."""
         h = observation(measured.states, _NB)
         factor = np.linalg.cholesky(h @ self._xx @ h.T + np.diag(measured.variance))
         white = np.linalg.solve(factor, innovation(measured, self._x[None], h)[0])
-        refused = self._refused[measured.instrument]
-        passed = gate <= 0 or white @ white <= gate * EXCEEDED[len(h)]
-        self._refused[measured.instrument] = 0 if passed else refused + 1
-        if not passed and refused < REFUSED:
-            return
         by_x, by_w = (np.linalg.solve(factor, h @ one) for one in (self._xx, self._xw))
         self._x += by_x.T @ white
         self._w += by_w.T @ white

@@ -15,8 +15,8 @@ from bayesrace.errors import InputError
 from bayesrace.learning.drives import Estimates
 from bayesrace.vehicles.parameters import CarParameters
 
-__all__ = ["MIRRORED_FEATURES", "MIRRORED_OUTPUTS", "ROUNDING", "SIGMAS", "Dataset", "concatenate", "dataset_from_arrays", "filter_dataset"]
-__all__ += ["consecutive", "left_out"]
+__all__ = ["MIRRORED_FEATURES", "MIRRORED_OUTPUTS", "ROUNDING", "SIGMAS", "Dataset", "concatenate"]
+__all__ += ["consecutive", "dataset_from_arrays", "filter_dataset", "left_out"]
 
 ROUNDING: Final = 1e-6
 """Permitted error of times, inputs and angles [SI units]; a plant in single precision errs by

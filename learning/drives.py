@@ -10,7 +10,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesrace.arrays import Floats, Rows
+from bayesrace.arrays import Flags, Floats, Rows
 from bayesrace.messages import QUANTITIES, Reading
 
 __all__ = ["POSE", "Drive", "Estimates", "Event", "Measured"]
@@ -35,7 +35,9 @@ class Drive:
     steering_rad: float = 0.0
     steering_deviation_rad: float = 0.0
     path: Floats | None = None
-    """At each event, as smoothed at first."""
+    """At each event, as smoothed last."""
+    refused: Flags | None = None
+    """Events whose reading is known to be wrong."""
 
     def turned_rad(self, time_s: float) -> float:
         """What the steering has turned since the first state, as it was commanded."""
@@ -66,7 +68,10 @@ class Drive:
             u = self.u[min(k, len(self.u) - 1)]
             events.append(Event(max(at_s - time_s, 0.0), k if one is None else -1, u, one))
             time_s = max(at_s, time_s)
-        return events
+        if self.refused is None:
+            return events
+        wrong = zip(events, self.refused, strict=True)
+        return [one._replace(measured=None) if known else one for one, known in wrong]
 
 
 class Measured(NamedTuple):

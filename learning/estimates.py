@@ -69,7 +69,7 @@ def smoothed_states(
         filled["x"][own], known[own] = found.x[:, :_NX], True
         deviation[own] = _deviation(found, drive, car, discretisation, None)
         origin[own, 0], origin[own, 1] = len(drives), found.rows
-        drives.append(replace(drive, path=found.path))
+        drives.append(replace(drive, path=found.path, refused=found.refused))
     kept = np.flatnonzero(known)
     if lost and not len(kept):
         reason = max(lost, key=lambda one: lost[one])

@@ -2,12 +2,11 @@
 
 A controller's estimate at a moment uses what was read before; learning can use what was read after
 it as well. A forward pass is an extended Kalman filter as that of controller/native/br_estimator.c
-(nine numbers: the states, and the offsets of the measured yaw rate and steering angle; the same
-gate; the residual of a period's beginning in all its parts), in order of measurement, so that no
-reading is late. Other than that one it begins vaguely, at speed, never widens its covariance, takes
-a reading after five of its instrument that were refused, and judges no instrument otherwise; nor
-does it keep the car to its limits. A backward pass, Rauch, Tung and Striebel's, takes
-in what came later (Särkkä, "Bayesian Filtering and Smoothing", section 9.1): with the gain
+(nine numbers: the states, and the offsets of the measured yaw rate and steering angle; the residual
+of a period's beginning in all its parts), in order of measurement, so that no reading is late.
+Other than that one it begins vaguely, at speed, never widens its covariance, and judges no
+instrument; nor does it keep the car to its limits. A backward pass, Rauch, Tung and Striebel's,
+takes in what came later (Särkkä, "Bayesian Filtering and Smoothing", section 9.1): with the gain
 
     G_k = P_k F_k' P_(k+1|k)^-1
 
@@ -17,15 +16,18 @@ in what came later (Särkkä, "Bayesian Filtering and Smoothing", section 9.1): 
 Two models predict. **Without weights** no model of the car does: the pose follows from the
 velocities, and these are twice integrated random walks in the car's frame (white jerk), as noisy as
 makes the readings most likely. The nominal model would bend the velocities to its own error, which
-is just what is to be learned. **With weights** it is the corrected model, with the variance that
-the weights state and the walk of ``car.tuning.estimator``, linearised along the first result.
+is just what is to be learned. Its gate is that of the C code, but for a reading after five of its
+instrument that were refused: what it has refused is left out for good. **With weights** it is the
+corrected model, with the variance that the weights state and the walk of ``car.tuning.estimator``,
+linearised along the first result; it has no gate, since where its weights know nothing it would
+refuse what is to be learned.
 
 Steering that no instrument reads is what was commanded, from what is known of it at the start: at a
 run's the wheels are straight, later the controller's estimate is as good as it states.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
 from typing import Any, Final, NamedTuple
@@ -34,7 +36,7 @@ import casadi as ca
 import numpy as np
 from scipy.special import chdtri
 
-from bayesrace.arrays import Floats, Rows
+from bayesrace.arrays import Flags, Floats, Rows
 from bayesrace.gp.expression import evaluate_mean, mean_function
 from bayesrace.gp.weights import GpWeights
 from bayesrace.integrators import Discretisation, pose_from_velocities
@@ -43,8 +45,8 @@ from bayesrace.learning.validation import NOMINAL, predictive_sigma
 from bayesrace.vehicles.parameters import CarParameters
 from bayesrace.vehicles.parts import GRAVITY_MPS2
 
-__all__ = ["EXCEEDED", "REFUSED", "Smoothed", "Steps", "begins", "blurred", "corrected_steps"]
-__all__ += ["innovation", "inputs_of", "observation", "smooth", "started"]
+__all__ = ["Smoothed", "Steps", "begins", "blurred", "corrected_steps", "innovation", "inputs_of"]
+__all__ += ["observation", "smooth", "started"]
 
 _NX: Final = 7
 _NB: Final = 9
@@ -55,9 +57,9 @@ _JERK_S: Final = 0.1
 _SEARCHED: Final = (4, 75)
 """Windows of a drive, evenly spread, and periods in each, that the random walk's noise is found
 by."""
-EXCEEDED: Final = {n: float(chdtri(n, 0.001)) for n in range(1, _NX + 1)}
+_EXCEEDED: Final = {n: float(chdtri(n, 0.001)) for n in range(1, _NX + 1)}
 """Squared distances that one of 1,000 right readings exceeds, as in the C code."""
-REFUSED: Final = 5
+_REFUSED: Final = 5
 """Readings of an instrument in a row: then it is the filter that is wrong."""
 _LINEARISED: Final = 2
 """Passes along the result of the one before."""
@@ -78,6 +80,8 @@ class Smoothed:
     """Of the readings, each predicted from those before."""
     path: Floats
     """All that was smoothed at every event, (e, 9 or more)."""
+    refused: Flags
+    """Events (e,) whose reading did not pass the gate."""
 
     def step_variance(self, slope: Floats) -> Floats:
         """Variances (m - 1, 3) of x_(k+1) - f(x_k, u_k) for vx, vy, omega, where f has these
@@ -106,6 +110,7 @@ class _Forward:
     p_ahead: Floats  # (e, b, m, m)
     f: Floats  # (e, b, m, m), from the event before
     likelihood: Floats  # (b,)
+    refused: Flags  # (e, b)
 
 
 def _forward(
@@ -114,7 +119,10 @@ def _forward(
     """The filter from ``x0`` (b, m) and ``p0`` (b, m, m) after the first event on."""
     (b, m), e = x0.shape, len(events)
     means, covariances = np.zeros((2, e, b, m)), np.zeros((3, e, b, m, m))
-    made = _Forward(means[0], covariances[0], means[1], covariances[1], covariances[2], np.zeros(b))
+    made = _Forward(
+        means[0], covariances[0], means[1], covariances[1], covariances[2],
+        np.zeros(b), np.zeros((e, b), np.bool_),
+    )  # fmt: skip
     refused = {one.measured.instrument: np.zeros(b, np.int64) for one in events if one.measured}
     x, p = x0, p0
     made.x[0], made.p[0] = x, p
@@ -129,16 +137,17 @@ def _forward(
         made.ahead[i], made.p_ahead[i] = x, p
         if event.measured is not None:
             own = refused[event.measured.instrument]
-            x, p = _updated(x, p, event.measured, gate, made.likelihood, own)
+            x, p, passed = _updated(x, p, event.measured, gate, made.likelihood, own)
+            made.refused[i] = ~passed
         made.x[i], made.p[i] = x, p
     return made
 
 
 def _updated(
     x: Floats, p: Floats, measured: Measured, gate: float, likelihood: Floats, refused: Rows
-) -> tuple[Floats, Floats]:
-    """With a reading, where the gate lets it pass, or has refused too many of its instrument in a
-    row (``refused``, (b,)); adds to the likelihoods (b,)."""
+) -> tuple[Floats, Floats, Flags]:
+    """With a reading, where the gate lets it pass (b,), or has refused too many of its instrument
+    in a row (``refused``, (b,)); adds to the likelihoods (b,)."""
     of, m = measured.states, x.shape[1]
     h, r = observation(of, m), np.diag(measured.variance)
     hp = h @ p
@@ -146,14 +155,14 @@ def _updated(
     new = innovation(measured, x, h)
     weighted = np.linalg.solve(s, np.concatenate([new[..., None], hp], axis=2))
     squared = np.einsum("bi,bi->b", new, weighted[..., 0])
-    limit = gate * EXCEEDED[len(of)] if gate > 0 else np.inf
-    passed = (squared <= limit) | (refused >= REFUSED)
+    limit = gate * _EXCEEDED[len(of)] if gate > 0 else np.inf
+    passed = (squared <= limit) | (refused >= _REFUSED)
     refused[:] = np.where(squared <= limit, 0, refused + 1)
     likelihood -= 0.5 * (np.minimum(squared, limit) + np.linalg.slogdet(s)[1])
     gain = np.swapaxes(weighted[..., 1:], 1, 2) * passed[:, None, None]
     left = np.eye(m) - gain @ h
     p = left @ p @ np.swapaxes(left, 1, 2) + gain @ r @ np.swapaxes(gain, 1, 2)
-    return x + np.einsum("bij,bj->bi", gain, new), p
+    return x + np.einsum("bij,bj->bi", gain, new), p, passed
 
 
 def innovation(measured: Measured, x: Floats, h: Floats) -> Floats:
@@ -200,7 +209,8 @@ def _backward(events: Sequence[Event], made: _Forward) -> Smoothed:
     rows = np.array([events[i].period for i in ends])
     mixed = np.array(cross[::-1]).reshape(len(ends) - 1, m, m)[:, :_NB, :_NB]
     likelihood = float(made.likelihood[0])
-    return Smoothed(rows, x[ends, :_NB], p[ends, :_NB, :_NB], mixed, likelihood, x)
+    kept = x[ends, :_NB], p[ends, :_NB, :_NB], mixed
+    return Smoothed(rows, *kept, likelihood, x, made.refused[:, 0])
 
 
 # The two models ----------------------------------------------------------------------------------
@@ -216,21 +226,24 @@ def smooth(
         return None
     if weights is None:
         return _walked(events, drive, car)
-    path = _walked(events, drive, car).path if drive.path is None else drive.path
+    path = drive.path
+    if path is None:
+        walked = _walked(events, drive, car)
+        path, drive = walked.path, replace(drive, refused=walked.refused)
+        events = drive.events
     for _ in range(_LINEARISED):
         model = _corrected(events, path[:, :_NB], car, discretisation, weights)
         x0, p0 = started(events[0], drive, car, path[0, :_NB])
         read = blurred(events, path, discretisation.step_s, weights)
         try:
             with np.errstate(over="ignore", invalid="ignore"):
-                made = _forward(read, x0[None], p0[None], model, car.tuning.estimator.gate)
-                found = _backward(read, made)
+                found = _backward(read, _forward(read, x0[None], p0[None], model, gate=0))
         except np.linalg.LinAlgError:  # what is believed has run away
             return None
         path = found.path
         if not _possible(path, car):
             return None
-    return found
+    return found if drive.refused is None else replace(found, refused=drive.refused)
 
 
 def _possible(path: Floats, car: CarParameters) -> bool:
@@ -243,7 +256,9 @@ def _possible(path: Floats, car: CarParameters) -> bool:
     return bool((np.abs(path[:, :_NX]) <= bounds).all())
 
 
-def started(first: Event, drive: Drive, car: CarParameters, around: Floats) -> tuple[Floats, Floats]:
+def started(
+    first: Event, drive: Drive, car: CarParameters, around: Floats
+) -> tuple[Floats, Floats]:
     """Mean and covariance after the first pose."""
     x, settings = around.copy(), car.tuning.estimation(nominal=True)
     p = np.diag(np.square(settings["start"]))
@@ -294,7 +309,8 @@ def blurred(
         return list(events)
     residual = evaluate_mean(weights, np.column_stack([begins(events, path)[:, 3:], u.T])[first])
     passed = np.cumsum(h[0])
-    tau = np.clip((passed - (passed - h[0])[first][period]) / step_s, 0, 1)
+    ended = passed[np.append(first[1:] - 1, -1)][period]
+    tau = np.clip(1 - (ended - passed) / step_s, 0, 1)
     error = np.gradient(residual, axis=0)[period] * (tau * (1 - tau) / 2)[:, None]
     found = [events[0]]
     for event, by in zip(events[1:], error, strict=True):

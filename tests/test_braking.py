@@ -22,6 +22,7 @@ from bayesrace.messages import TRUTH, BrakingPlan, State
 from bayesrace.operation.closed_loop import ClosedLoop
 from bayesrace.operation.drive import RunPlan, run_request
 from bayesrace.operation.system import started_system
+from bayesrace.plant.car import End
 from bayesrace.plant.vehicle import planned_at
 from bayesrace.recorder import Recorder
 from tests.racing import Racing, prepared, racing
@@ -44,7 +45,7 @@ def race(request: pytest.FixtureRequest) -> Racing:
 class Cut(ClosedLoop):
     """A car whose controller is gone from a moment on; only what it has sent before is left."""
 
-    def _exchange(self, state: State, x: tuple[float, ...]) -> tuple[float, ...]:
+    def _exchange(self, state: State, x: tuple[float, ...]) -> tuple[float, ...] | End:
         if state.time_s < CUT_S - 1e-9:
             answer = super()._exchange(state, x)
             self.plan, output = self._cycle.driver.braking(0), self._cycle.driver.output
@@ -59,7 +60,7 @@ class Cut(ClosedLoop):
 class Silent(ClosedLoop):
     """A car whose controller gets no states from a moment on."""
 
-    def _exchange(self, state: State, x: tuple[float, ...]) -> tuple[float, ...]:
+    def _exchange(self, state: State, x: tuple[float, ...]) -> tuple[float, ...] | End:
         if state.time_s < CUT_S - 1e-9:
             return super()._exchange(state, x)
         self._true_x.append(x)

@@ -104,17 +104,12 @@ def dense(
         by_e[:7] = step.by_error[i]
         state[:, at[4 + i] : at[5 + i]] += by_e
         state[:, at[4 + e + i] : at[5 + e + i]] += np.eye(9)
-        if event.measured is None or abs(event.measured.value[0] - path[i + 1, 0]) > 0.1 and (
-            0 in event.measured.states
-        ):
-            continue
-        for number, value, variance in zip(*event.measured[1:4], strict=True):
-            row = state[number] + (state[7] if number == 5 else 0)
-            error = value - constant[number] - (constant[7] if number == 5 else 0)
-            if number == 2:
-                error -= 2 * np.pi * np.round((error - row @ mean) / (2 * np.pi))
-            rows.append(row)
-            values.append(error)
+        for number, value, variance in zip(*(event.measured or [()] * 4)[1:4], strict=True):
+            offset = number == 5
+            rows.append(state[number] + offset * state[7])
+            error = value - constant[number] - offset * constant[7]
+            turns = np.round((error - rows[-1] @ mean) / (2 * np.pi)) * (number == 2)
+            values.append(error - 2 * np.pi * turns)
             variances.append(variance)
     target = residual(samples, PREDICTION)
     for j in range(len(samples)):
@@ -127,12 +122,10 @@ def dense(
     gain = np.linalg.solve(seen_by @ across + np.diag(variances), across.T).T
     mean = mean + gain @ (np.array(values) - seen_by @ mean)
     left = np.diag(covariance - gain @ across.T)
-    own = [alone[k][:new] - SHARE * weights.outputs[k].noise_variance * weights.outputs[k].y_scale**2
-           for k in range(3)]  # fmt: skip
-    return (
-        np.column_stack([mean[at[k] : at[k] + new] for k in range(3)]),
-        np.column_stack([left[at[k] : at[k] + new] + own[k] for k in range(3)]),
-    )
+    here = [slice(at[k], at[k] + new) for k in range(3)]
+    shares = [SHARE * one.noise_variance * one.y_scale**2 for one in weights.outputs]
+    found = [left[one] + alone[k][:new] - shares[k] for k, one in enumerate(here)]
+    return np.column_stack([mean[one] for one in here]), np.column_stack(found)
 
 
 def prior(
@@ -162,7 +155,8 @@ def test_it_is_what_all_readings_and_samples_at_once_say(
     x, u, drive = short_drive(make, car)
     found = smooth(drive, car, PREDICTION, weights)
     assert found is not None
-    drive = replace(drive, path=found.path)
+    drive = replace(drive, path=found.path, refused=found.refused)
+    assert found.refused.sum() == 1
     random = np.random.default_rng(3)
     settled = Estimates.settled(random.uniform(0.01, 0.05, (4, 4)))
     few = Dataset(car, STEP_S, x[:4], u[:4], random.normal(x[1:5], 0.02), estimates=settled)
@@ -198,7 +192,8 @@ def test_a_mean_of_readings_errs_less_than_one_of_smoothed_states(seed: int) -> 
     assert training is not None
     settings, lap = TrainingSettings(capacity=400), race.driven.samples()
     learned = samples_of(seen(training.samples, seed, ROUGH))
-    weights, before = (fit(one, PREDICTION, settings).weights for one in (learned, learned.settled()))
+    both = learned, learned.settled()
+    weights, before = (fit(one, PREDICTION, settings).weights for one in both)
     truth, z = residual(lap, PREDICTION), lap.features
     error, error_before = (truth - evaluate_mean(one, z) for one in (weights, before))
     assert ((error**2).mean(axis=0) < (0.7, 0.85, 0.6) * (error_before**2).mean(axis=0)).all()

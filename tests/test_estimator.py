@@ -459,7 +459,7 @@ def test_a_training_drive_by_motion_capture_stays_on_its_track(
     line = compute_raceline(track, car)
     settings = PreparationSettings(car=car, sensors=sensors)
     artefact, _ = build(BuildSettings(car=car))
-    driven = drive_for_training(settings, track, line, car, artefact, tmp_path / "drive.mcap")
+    *_, driven = drive_for_training(settings, track, line, car, artefact, tmp_path / "drive.mcap")
     assert track.project_path(driven.x[:, :2]).off_track_m.max() < 0
     assert driven.x[:, 3].mean() > 1.5
     assert np.mean(driven.levels == 0) > 0.9

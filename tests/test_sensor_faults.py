@@ -17,6 +17,7 @@ from bayesrace.controller.assembly import compiled_controller
 from bayesrace.controller.driver import Level
 from bayesrace.messages import State
 from bayesrace.operation.closed_loop import ClosedLoop, Driven, built_in_car
+from bayesrace.plant.car import End
 from bayesrace.vehicles import get_car
 from tests.racing import Racing, racing
 
@@ -109,7 +110,7 @@ class Faulty(ClosedLoop):
         self.faults: list[str] = []
         """Of each state from the beginning on."""
 
-    def _exchange(self, state: State, x: tuple[float, ...]) -> tuple[float, ...]:
+    def _exchange(self, state: State, x: tuple[float, ...]) -> tuple[float, ...] | End:
         if state.time_s >= BEGIN_S - 1e-9:
             self._since.append(state)
             if state.time_s < self._end_s - 1e-9:
@@ -171,7 +172,7 @@ class Noisy(ClosedLoop):
     noise: Sequence[float] = (0.0,) * 7
     random = np.random.default_rng(0)
 
-    def _exchange(self, state: State, x: tuple[float, ...]) -> tuple[float, ...]:
+    def _exchange(self, state: State, x: tuple[float, ...]) -> tuple[float, ...] | End:
         noisy = tuple(self.random.normal(x, self.noise).tolist())
         return super()._exchange(replace(state, x=noisy), x)
 

@@ -202,7 +202,7 @@ def test_its_covariance_is_that_of_its_errors(by: tuple[float, ...]) -> None:
         for name, weights in (("walk", None), ("weights", race.weights)):
             found = smooth(drive, race.car, PREDICTION, weights)
             assert found is not None
-            drive = replace(drive, path=found.path)
+            drive = replace(drive, path=found.path, refused=found.refused)
             error = found.x[:, :6] - x[found.rows, :6]
             error[:, 2] = np.remainder(error[:, 2] + np.pi, 2 * np.pi) - np.pi
             solved = np.linalg.solve(found.covariance[:, :6, :6], error[..., None])[..., 0]
