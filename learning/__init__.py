@@ -4,7 +4,8 @@ In the order of use:
 
 1. :mod:`.sources` reads one-step samples from run logs and plain arrays; :mod:`.dataset` holds
    and filters them. Where states are to be estimated, :mod:`.drives` holds what was read, and
-   :mod:`.smoothing` makes states of it, :mod:`.estimates` samples.
+   :mod:`.smoothing` makes states of it, :mod:`.estimates` samples, and :mod:`.conditioning`
+   weights.
 2. :mod:`.gaussian_process` predicts with a GP, and finds its hyperparameters.
 3. :mod:`.subset` chooses the samples that a GP keeps, and those that cross-validation leaves out.
    :mod:`.target` is one output to learn, and scores predictions of it.

@@ -59,6 +59,8 @@ _RATIO: Final = 0.01
 """Noise over signal with which the most informative samples are chosen."""
 _ROUNDING: Final = 1e-6
 """Of the mean variance, for the factor of Z that are nearly alike."""
+_ALIKE: Final = 8.0
+"""Smoothed states in a row that err alike: what so many of them say, one does."""
 _COMPARED: Final = 400
 """Samples that variances are compared at."""
 _NX: Final = 7
@@ -235,7 +237,7 @@ class _Belief:
         before any drive."""
         for k, (basis, own) in enumerate(zip(self._bases, self.parts, strict=True)):
             phi = basis.at(z)
-            variance = deviation[:, k] ** 2 + self._noise[k] + basis.lacking(z, phi)
+            variance = _ALIKE * deviation[:, k] ** 2 + self._noise[k] + basis.lacking(z, phi)
             weighted = phi / variance[:, None]
             covariance = np.linalg.inv(np.eye(phi.shape[1]) + weighted.T @ phi)
             self._ww[own, own] = covariance
