@@ -71,7 +71,7 @@ class Drive:
         if self.refused is None:
             return events
         wrong = zip(events, self.refused, strict=True)
-        return [one._replace(measured=None) if known else one for one, known in wrong]
+        return [one.without() if known else one for one, known in wrong]
 
 
 class Measured(NamedTuple):
@@ -99,6 +99,10 @@ class Event(NamedTuple):
     period: int  # number of the state whose time it is; -1: none
     u: Floats  # acted since the event before
     measured: Measured | None
+
+    def without(self) -> "Event":
+        """The same without its reading."""
+        return self._replace(measured=None)
 
 
 def _first_pose(read: Sequence[Measured]) -> int | None:

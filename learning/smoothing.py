@@ -54,6 +54,8 @@ _VAGUE: Final = 10.0
 """Times the tuning's deviations of a start from rest: a drive may begin at speed."""
 _JERK_S: Final = 0.1
 """In which accelerations change by their full range: the middle of the search."""
+_LOOSER: Final = 30.0
+"""Times as noisy, the random walk judges readings: what a car can do, it refuses none of."""
 _SEARCHED: Final = (4, 75)
 """Windows of a drive, evenly spread, and periods in each, that the random walk's noise is found
 by."""
@@ -452,8 +454,12 @@ def _walked(events: Sequence[Event], drive: Drive, car: CarParameters) -> Smooth
             x = np.tile(path[first] if first else x0, (len(tried), 1))
             found += _forward(events[first:last], x, p, partial(_later, go, first), gate).likelihood
         density = tried[[int(np.argmax(found))]]
-    made = _forward(events, x0[None], p0[None], _along(path, walk, u, h, density), gate)
-    return _backward(events, made)
+    loose = _along(path, walk, u, h, _LOOSER * density)
+    refused = _forward(events, x0[None], p0[None], loose, gate).refused[:, 0]
+    kept = [one.without() if wrong else one for one, wrong in zip(events, refused, strict=True)]
+    go = _along(path, walk, u, h, density)
+    found = _backward(kept, _forward(kept, x0[None], p0[None], go, gate=0))
+    return replace(found, refused=refused)
 
 
 def _windows(events: Sequence[Event]) -> list[tuple[int, int]]:

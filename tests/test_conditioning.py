@@ -26,6 +26,8 @@ from tests.test_smoothing import NAMES, POSE, of, read, samples_of, seen
 MIRROR = np.array([1, -1, -1, -1, 1, -1])
 PARITY = (1, -1, -1)
 ROUGH = (0.001, 0.001, np.deg2rad(0.5))
+ALIKE = 8
+"""Smoothed states count as one of so many."""
 SHARE = 0.5
 """Of the noise of weights, what is their model's."""
 
@@ -116,7 +118,7 @@ def dense(
         for k in range(3):
             rows.append(np.eye(at[-1])[at[k] + new + j])
             values.append(target[j, k])
-            variances.append(samples.deviation[j, k] ** 2 + alone[k][new + j])
+            variances.append(ALIKE * samples.deviation[j, k] ** 2 + alone[k][new + j])
     seen_by = np.array(rows)
     across = covariance @ seen_by.T
     gain = np.linalg.solve(seen_by @ across + np.diag(variances), across.T).T

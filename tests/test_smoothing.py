@@ -189,6 +189,20 @@ def test_what_one_instrument_reads_does_not_keep_another_from_being_heard(
     assert np.abs(found.x[-1, 1] - 0.5) < 0.01
 
 
+def test_what_it_refuses_is_what_is_wrong() -> None:
+    """Of a learned car's laps at the limit, over three seeds."""
+    race = racing()
+    x, inputs = race.driven.x, np.array([one.u_applied for one in race.driven.states[1:]])
+    for seed in range(3):
+        drive = of(x, inputs, poses(np.random.default_rng(seed), x))
+        found = smooth(drive, race.car, PREDICTION, None)
+        assert found is not None
+        for event, refused in zip(drive.events, found.refused, strict=True):
+            if (one := event.measured) is not None:
+                apart = np.abs(one.value[:2] - x[round(one.time_s / STEP_S), :2])
+                assert refused == (apart.max() > 0.01)
+
+
 @pytest.mark.parametrize("by", [POSE, (0.001, 0.001, np.deg2rad(0.5))])
 def test_its_covariance_is_that_of_its_errors(by: tuple[float, ...]) -> None:
     """On a learned car's own lap, over three seeds; outliers and gaps included. The random walk is
