@@ -458,8 +458,8 @@ def _walked(events: Sequence[Event], drive: Drive, car: CarParameters) -> Smooth
     refused = _forward(events, x0[None], p0[None], loose, gate).refused[:, 0]
     kept = [one.without() if wrong else one for one, wrong in zip(events, refused, strict=True)]
     go = _along(path, walk, u, h, density)
-    found = _backward(kept, _forward(kept, x0[None], p0[None], go, gate=0))
-    return replace(found, refused=refused)
+    smoothed = _backward(kept, _forward(kept, x0[None], p0[None], go, gate=0))
+    return replace(smoothed, refused=refused)
 
 
 def _windows(events: Sequence[Event]) -> list[tuple[int, int]]:
