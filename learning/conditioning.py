@@ -32,12 +32,12 @@ import numpy as np
 from scipy.linalg import cholesky, solve_triangular
 from scipy.optimize import brentq
 
-from bayesrace.arrays import Floats
+from bayesrace.arrays import Flags, Floats, Rows
 from bayesrace.gp.expression import evaluate_mean, kernel_matrix
 from bayesrace.gp.weights import FEATURES, GpOutput, GpWeights
 from bayesrace.integrators import Discretisation
 from bayesrace.learning.dataset import MIRRORED_FEATURES, MIRRORED_OUTPUTS, Dataset
-from bayesrace.learning.drives import Drive, Event, Measured
+from bayesrace.learning.drives import Drive, Estimates, Event, Measured
 from bayesrace.learning.smoothing import (
     begins,
     blurred,
@@ -83,21 +83,21 @@ def conditioned(
     ``noise_share``: of the variance of their noise, what is the model's. LinAlgError where they
     cannot follow the readings.
     """
-    images = 2 if dataset.car.mirrored_samples else 1
+    images = 2 if dataset.car.mirrored_samples and capacity > 1 else 1
     count, z = max(1, min(_BASIS, capacity // images)), dataset.features
     bases = [
         _Basis.of(output, z, count, parity if images == 2 else 0)
         for output, parity in zip(weights.outputs, MIRRORED_OUTPUTS, strict=True)
     ]
     belief = _Belief(bases, noise_share)
-    estimates = dataset.estimates
-    drives = () if estimates is None else estimates.drives
-    settled = np.ones(len(dataset), bool) if estimates is None else estimates.origin[:, 0] < 0
-    if settled.any():
+    estimates = dataset.estimates or Estimates.exact(len(dataset))
+    number, place = estimates.origin.T
+    if (settled := number < 0).any():
         samples = dataset.select(settled)
         belief.measure(samples.features, residual(samples, discretisation), samples.deviation)
-    for drive in drives:
-        belief.follow(drive, dataset.car, discretisation, weights)
+    for k, drive in enumerate(estimates.drives):
+        if (own := number == k).any():
+            belief.follow(drive, place[own], dataset.car, discretisation, weights)
     mean, covariance = belief.result()
     some = z[evenly(len(z), _COMPARED)]
     outputs = [
@@ -191,10 +191,20 @@ def _noise_for(output: GpOutput, inputs: Floats, z: Floats, wanted: float) -> fl
         left = 1 - squares @ (1 / (values + np.exp(log_noise)))
         return float(np.log(np.maximum(np.mean(left), 1e-14) / wanted))
 
+    if not 0 < wanted < np.inf:
+        raise np.linalg.LinAlgError("the readings leave no variance")
     least, most = np.log([1e-9, 1e3])
     if excess(least) > 0:
         return float(np.exp(least))
     return float(np.exp(brentq(excess, least, most, xtol=1e-3) if excess(most) > 0 else most))
+
+
+def _periods(events: Sequence[Event]) -> Rows:
+    """The number of the state that ends the period of each event but the first."""
+    numbers = np.array([one.period for one in events])
+    ends = np.flatnonzero(numbers >= 0)
+    following = np.minimum(np.searchsorted(ends, np.arange(1, len(events))), len(ends) - 1)
+    return np.asarray(numbers[ends[following]])
 
 
 class _Chain(NamedTuple):
@@ -238,20 +248,31 @@ class _Belief:
         for k, (basis, own) in enumerate(zip(self._bases, self.parts, strict=True)):
             phi = basis.at(z)
             variance = _ALIKE * deviation[:, k] ** 2 + self._noise[k] + basis.lacking(z, phi)
+            variance += _ROUNDING**2 * basis.scale**2
             weighted = phi / variance[:, None]
             covariance = np.linalg.inv(np.eye(phi.shape[1]) + weighted.T @ phi)
             self._ww[own, own] = covariance
             self._w[own] = covariance @ (weighted.T @ (g[:, k] - basis.offset))
 
     def follow(
-        self, drive: Drive, car: CarParameters, discretisation: Discretisation, weights: GpWeights
+        self,
+        drive: Drive,
+        samples: Rows,
+        car: CarParameters,
+        discretisation: Discretisation,
+        weights: GpWeights,
     ) -> None:
-        """Takes in all readings of a drive, linearised along its path and ``weights``."""
+        """Takes in all readings of a smoothed drive, linearised along its path and ``weights``.
+
+        ``samples``: the states in it that periods to learn from begin with. In others the
+        correction is anything that it could be a priori.
+        """
         events, path = drive.events, drive.path
         if path is None:
-            return
+            raise ValueError("the drive has not been smoothed")
         path = path[:, :_NB]
-        chain = self._chain(events, path, car, discretisation, weights)
+        learned = np.isin(_periods(events) - 1, samples)
+        chain = self._chain(events, path, learned, car, discretisation, weights)
         self._x, self._xx = started(events[0], drive, car, path[0])
         self._xw[:] = 0
         read = blurred(events, path, discretisation.step_s, weights)
@@ -266,6 +287,7 @@ class _Belief:
         self,
         events: Sequence[Event],
         path: Floats,
+        learned: Flags,
         car: CarParameters,
         discretisation: Discretisation,
         weights: GpWeights,
@@ -274,7 +296,7 @@ class _Belief:
         u, h = columns[0].T, columns[1][0]
         step = corrected_steps(path[:-1, :_NX], begin, u, h, car, discretisation, weights)
         z, share = np.column_stack([begin[:, 3:], u]), h / discretisation.step_s
-        phi = [basis.at(z) for basis in self._bases]
+        phi = [learned[:, None] * basis.at(z) for basis in self._bases]
         lacking = [basis.lacking(z, one) for basis, one in zip(self._bases, phi, strict=True)]
         spread = np.sqrt((np.column_stack(lacking) + self._noise) * share[:, None])
         spread = step.by_error * spread[:, None]

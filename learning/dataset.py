@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from typing import Final
 
 import numpy as np
+from msgspec.msgpack import encode
 from numpy.typing import ArrayLike
 
 from bayesrace.arrays import Flags, Floats
@@ -119,10 +120,12 @@ class Dataset:
         return replace(self, estimates=Estimates.settled(self.deviation))
 
     def digest(self) -> str:
-        """sha256 over car, step and samples."""
+        """sha256 over car, step, samples, and what was read in their drives."""
         text = f"{self.car.name}/{self.car.digest()}/{self.step_s!r}/{len(self)}"
         total = hashlib.sha256(text.encode())
-        known = [] if self.estimates is None else [self.deviation]
+        known = [] if self.estimates is None else [self.deviation, self.estimates.origin]
+        for drive in () if self.estimates is None else self.estimates.drives:
+            total.update(encode(drive.readings))
         for array in (self.x, self.u, self.x_next, *known):
             total.update(array.astype("<f8", order="C").tobytes())
         return total.hexdigest()

@@ -77,26 +77,27 @@ def smoothed_states(
     return filled[kept], Estimates(deviation, origin, tuple(drives)).select(kept), lost
 
 
-def smoothed_again(
-    dataset: Dataset, discretisation: Discretisation, weights: GpWeights
-) -> Dataset | None:
-    """The same samples, those whose drives are at hand smoothed by the corrected model; None where
-    it cannot follow one of them."""
+def smoothed_again(dataset: Dataset, discretisation: Discretisation, weights: GpWeights) -> Dataset:
+    """The same samples, those whose drives are at hand smoothed by the corrected model. Those of a
+    drive that it cannot follow stay as they are, without their drive."""
     estimates = dataset.estimates
     if estimates is None:
         return dataset
     x, x_next, deviation = dataset.x.copy(), dataset.x_next.copy(), estimates.deviation.copy()
+    origin = estimates.origin.copy()
     drives: list[Drive] = []
     for number, drive in enumerate(estimates.drives):
         found = smooth(drive, dataset.car, discretisation, weights)
         own = np.flatnonzero(estimates.origin[:, 0] == number)
         if found is None:
-            return None
+            origin[own] = -1
+            drives.append(drive)
+            continue
         place = np.searchsorted(found.rows, estimates.origin[own, 1])
         x[own], x_next[own] = found.x[place, :_NX], found.x[place + 1, :_NX]
         deviation[own] = _deviation(found, drive, dataset.car, discretisation, weights)[place]
-        drives.append(replace(drive, path=found.path))
-    again = replace(estimates, deviation=deviation, drives=tuple(drives))
+        drives.append(replace(drive, path=found.path, refused=found.refused))
+    again = Estimates(deviation, origin, tuple(drives)).select(slice(None))
     return replace(dataset, x=x, x_next=x_next, estimates=again)
 
 
@@ -106,26 +107,22 @@ def learned_in_turns(
     weights: GpWeights | None,
     learn: Callable[[Dataset, GpWeights | None], L],
     capacity: int,
-) -> tuple[Dataset, L, GpWeights | None]:
+) -> tuple[Dataset, L, GpWeights]:
     """The samples smoothed, what ``learn`` has made of them, and its weights conditioned on the
-    readings, each by the weights before, ``weights`` or such of the samples as they are given.
+    readings, each by the weights before: ``weights``, or such of the samples as they are given.
 
-    None in place of the last where no model can follow the drives. ``capacity``: points of an
-    output at most. Variances are not to be widened by ``learn``.
+    Weights that are not conditioned where the filter fails. ``capacity``: points of an output at
+    most. Variances are not to be widened by ``learn``.
     """
-    made, found = learn(dataset, weights), None
-    before = _surer(weights or made.weights)
+    before = weights or _surer(learn(dataset, None).weights)
     for _ in range(_ROUNDS):
-        smoothed = smoothed_again(dataset, discretisation, before)
-        if smoothed is None:
-            break
-        again = learn(smoothed, before)
+        dataset = smoothed_again(dataset, discretisation, before)
+        made = learn(dataset, before)
         try:
-            found = conditioned(again.weights, smoothed, discretisation, capacity, _NOISE)
-        except np.linalg.LinAlgError:
-            break
-        dataset, made, before = smoothed, again, found
-    return dataset, made, found
+            before = conditioned(made.weights, dataset, discretisation, capacity, _NOISE)
+        except (np.linalg.LinAlgError, InputError):
+            return dataset, made, made.weights
+    return dataset, made, before
 
 
 def _surer(weights: GpWeights) -> GpWeights:

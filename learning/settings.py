@@ -62,7 +62,7 @@ class TrainingSettings(BaseModel):
         WIDEN,
         ge=1,
         le=100,
-        description="factor on the standard deviations of weights that begin with no others: what "
-        "is driven with them differs from the samples",
+        description="factor on the standard deviations of weights that begin with no others, where "
+        "states are measured: what is driven with them differs from the samples",
     )
     threads: int = Field(0, ge=0, description="parallel fits; 0 is one per core")

@@ -17,7 +17,8 @@ Two models predict. **Without weights** no model of the car does: the pose follo
 velocities, and these are twice integrated random walks in the car's frame (white jerk), as noisy as
 makes the readings most likely. The nominal model would bend the velocities to its own error, which
 is just what is to be learned. Its gate is that of the C code, but for a reading after five of its
-instrument that were refused: what it has refused is left out for good. **With weights** it is the
+instrument that were refused, and for a random walk that is noisier still: what it has refused is
+left out for good. **With weights** it is the
 corrected model, with the variance that the weights state and the walk of ``car.tuning.estimator``,
 linearised along the first result; it has no gate, since where its weights know nothing it would
 refuse what is to be learned.
@@ -55,7 +56,8 @@ _VAGUE: Final = 10.0
 _JERK_S: Final = 0.1
 """In which accelerations change by their full range: the middle of the search."""
 _LOOSER: Final = 30.0
-"""Times as noisy, the random walk judges readings: what a car can do, it refuses none of."""
+"""Times its most likely noise, with which the random walk judges readings: so it refuses nothing
+that a car can do."""
 _SEARCHED: Final = (4, 75)
 """Windows of a drive, evenly spread, and periods in each, that the random walk's noise is found
 by."""
@@ -78,8 +80,6 @@ class Smoothed:
     """(m, 9, 9)"""
     cross: Floats
     """(m - 1, 9, 9): of each state with the one before, in this order."""
-    log_likelihood: float
-    """Of the readings, each predicted from those before."""
     path: Floats
     """All that was smoothed at every event, (e, 9 or more)."""
     refused: Flags
@@ -210,9 +210,8 @@ def _backward(events: Sequence[Event], made: _Forward) -> Smoothed:
             end, since = i, np.eye(m)
     rows = np.array([events[i].period for i in ends])
     mixed = np.array(cross[::-1]).reshape(len(ends) - 1, m, m)[:, :_NB, :_NB]
-    likelihood = float(made.likelihood[0])
     kept = x[ends, :_NB], p[ends, :_NB, :_NB], mixed
-    return Smoothed(rows, *kept, likelihood, x, made.refused[:, 0])
+    return Smoothed(rows, *kept, x, made.refused[:, 0])
 
 
 # The two models ----------------------------------------------------------------------------------

@@ -15,6 +15,9 @@
    by cross-validation is the known remedy (Bachoc, "Cross validation and maximum likelihood
    estimations of hyper-parameters of Gaussian processes with model misspecification", CSDA 2013).
 
+Where states are estimated, weights are conditioned on the readings of the drives instead of 4 and 5
+(:mod:`bayesrace.learning.conditioning`); the metrics are still those of the samples.
+
 Only training samples are used for any of this. The metrics in the weights are scores of the errors
 held out by stretches, each stretch with a scale found on the others and without ``widen``, which is
 for other driving; hyperparameters, kernel and choice of samples depend on all stretches.
@@ -129,8 +132,6 @@ def fit(
         dataset, made, found = learned_in_turns(
             dataset, discretisation, initial, learn, settings.capacity
         )
-    if found is None:  # no model can follow the drives
-        return _fit(dataset, discretisation, settings, initial, widen, report)
     return Training(_named(found), made.kernels, dataset)
 
 

@@ -77,8 +77,9 @@ def collect(
     sensors: Sensors = EXACT,
     delay_s: float = 0.0,
 ) -> list[Driven]:
-    """Drives for ``duration_s`` in all, a lap at least in the last drive, which is the first that
-    neither leaves the track nor spins; logs all drives at ``path``, as runs from the start line.
+    """Drives for ``duration_s`` in all, or longer, as each drive is to pass the whole line, until
+    one neither leaves the track nor spins; logs all drives at ``path``, as runs from the start
+    line.
 
     Each is slower than the one before, to the last of ten. With a ``speed_scale`` in ``settings``
     there is but one. ``sensors``, ``delay_s``: as in :class:`ClosedLoop`, the seed is that of

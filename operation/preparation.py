@@ -88,7 +88,7 @@ class PreparedTrack:
 
 @dataclass(frozen=True, eq=False)
 class Training:
-    """The training drive, and what can be learned from it."""
+    """The training drives, and what can be learned from them."""
 
     driven_on: PreparedTrack
     log: Path
@@ -231,7 +231,7 @@ def _training_drive(
 
 
 def _drive_s(settings: PreparationSettings, car: CarParameters, line: RaceLine) -> float:
-    """Length of the training drive."""
+    """Length of the training drives."""
     return settings.collect_s or drive_length_s(car, line, settings.instruments)
 
 

@@ -47,14 +47,17 @@ class PreparationSettings(CarSimulation):
         None,
         ge=1,
         le=3600,
-        description="length of the training drive [s]; None: the car's, and a lap at least",
+        description="length of the training drives [s]; None: the car's, and a lap at least",
     )
     points: int = Field(400, ge=20, le=1024, description="training points per output")
     kernels: tuple[Kernel, ...] = Field(
         DEFAULT_KERNELS, min_length=1, description="candidates of the GPs; held-out errors decide"
     )
     widen: float = Field(
-        WIDEN, ge=1, le=100, description="factor on the standard deviations of first weights"
+        WIDEN,
+        ge=1,
+        le=100,
+        description="factor on the standard deviations of first weights, where states are measured",
     )
     threads: int = Field(
         0, ge=0, description="of the training, which they do not change; 0: one per core"

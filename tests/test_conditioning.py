@@ -26,6 +26,8 @@ from tests.test_smoothing import NAMES, POSE, of, read, samples_of, seen
 MIRROR = np.array([1, -1, -1, -1, 1, -1])
 PARITY = (1, -1, -1)
 ROUGH = (0.001, 0.001, np.deg2rad(0.5))
+UNKNOWN = (5, 6)
+"""Periods that are not learned from."""
 ALIKE = 8
 """Smoothed states count as one of so many."""
 SHARE = 0.5
@@ -50,7 +52,8 @@ def dense(
     weights: GpWeights, made: GpWeights, samples: Dataset, drive: Drive, z: Floats, images: bool
 ) -> tuple[Floats, Floats]:
     """Means and variances (n, 3) of the correction at ``z`` (n, 6): the joint Gaussian of it, the
-    start and all noise, conditioned on all readings and samples at once.
+    start and all noise, conditioned on all readings and samples at once. In the :data:`UNKNOWN`
+    periods it may be anything.
 
     ``made``: has the points that span the corrections.
     """
@@ -67,6 +70,10 @@ def dense(
     priors, alone, offsets = [], [], []
     for before, after, parity in zip(weights.outputs, made.outputs, PARITY, strict=True):
         spanned, own, offset = prior(before, after, places, parity if images else 0)
+        ended = np.cumsum([one.period >= 0 for one in events])[:-1]
+        unknown = known + np.flatnonzero(np.isin(ended, UNKNOWN))
+        own[unknown] += np.diag(spanned)[unknown]
+        spanned[unknown], spanned[:, unknown] = 0, 0
         priors.append(spanned)
         alone.append(own + SHARE * before.noise_variance * before.y_scale**2)
         offsets.append(offset)
@@ -165,6 +172,7 @@ def test_it_is_what_all_readings_and_samples_at_once_say(
     origin = np.column_stack([np.zeros(14, int), np.arange(14)])
     estimates = Estimates(np.full((14, 4), 0.01), origin, (drive,))
     smoothed = Dataset(car, STEP_S, x[:-1], u, x[1:], estimates=estimates)
+    smoothed = smoothed.select(~np.isin(np.arange(14), UNKNOWN))
     made = conditioned(
         weights, concatenate([few, smoothed]), PREDICTION, 10 if mirrored else 5, SHARE
     )

@@ -124,8 +124,8 @@ class GpOutput:
     ``inputs`` (n, 6) are training inputs in the features' own units, ``alpha`` (n,) is
     (K + noise)^-1 y of the scaled targets y = (residual - y_mean) / y_scale, ``length_scales`` (6,)
     have the features' units. ``signal_variance`` and ``noise_variance`` are in units of scaled y.
-    Where states were estimated, the noise in alpha is each sample's own, the learned one and what
-    smoothing left unknown, and ``noise_variance`` has the median of the latter in it.
+    Where states were estimated, ``alpha`` is that of the mean that the readings leave, and
+    ``noise_variance`` what leaves their variance (:mod:`bayesrace.learning.conditioning`).
     n = 0 means no correction beyond ``y_mean``. Raises InputError for anything inconsistent.
     """
 

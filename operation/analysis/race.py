@@ -210,7 +210,7 @@ class RaceAnalysis:
 
     @cached_property
     def training(self) -> DrivenRun | None:
-        """The training drive, all of it; None where weights were given."""
+        """The last training drive, all of it; None where weights were given."""
         found = self.recording.training
         return None if found is None else DrivenRun(found.run, found.track, found.line, whole=True)
 

@@ -168,7 +168,7 @@ def _of_run(rows: Columns, run: int) -> Columns:
 
 @dataclass(frozen=True, eq=False)
 class TrainingRecord:
-    """The training drive of a race, with the track and the line that it was driven on."""
+    """The last training drive of a race, with the track and the line that it was driven on."""
 
     run: RunRecord
     track: Track

@@ -143,7 +143,8 @@ class RaceResult(_Frozen):
     settings: SettingsSummary
     laps: list[LapResult]
     training: LapResult | None = Field(
-        None, description="the training drive on its own track, all of its samples; null without"
+        None,
+        description="the last training drive on its own track, all of its samples; null without",
     )
     gp: dict[str, GpMetrics] = Field(
         description="output (vx, vy, omega) to metrics of the first weights on the BestCase run; "
