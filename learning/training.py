@@ -132,7 +132,11 @@ def fit(
         dataset, made, found = learned_in_turns(
             dataset, discretisation, initial, learn, settings.capacity
         )
-    return Training(_named(found), made.kernels, dataset)
+    metrics = dict(found.metrics)
+    for name, output in zip(OUTPUTS, found.outputs, strict=True):
+        key = f"training {name}"
+        metrics[key] = {**metrics[key], "points": float(output.count)}
+    return Training(_named(replace(found, metrics=metrics)), made.kernels, dataset)
 
 
 def _named(weights: GpWeights) -> GpWeights:

@@ -2,11 +2,12 @@
 
 A racing line touches the edges of the track, and a driver that is disturbed on purpose, and slides,
 leaves it there. So a drive follows the racing line where that leaves room to the edges, and else
-a line made of it. It ends where it leaves the track or spins, and the next one is slower there;
-elsewhere it stays as fast, as a residual is known at the speeds only that were driven. Where that
-does not help, the line is too fast everywhere, and so it is if the fallback has to brake often,
-because the car was lost sight of. Drives that have failed are learned from as well: up to there
-they were the fastest ones.
+a line made of it. Where it leaves the track or spins, the next one is slower there; elsewhere it
+stays as fast, as a residual is known at the speeds only that were driven. Where that does not help,
+the line is too fast everywhere, and so it is if the fallback has to brake often, because the car
+was lost sight of. Where states are estimated drives that have failed are learned from as well: most
+do, and up to there they were the fastest ones. Of exact states the last drive says enough, and what
+a car does that slides off is a model's worst part to learn.
 """
 
 from collections.abc import Sequence
@@ -77,9 +78,11 @@ def collect(
     sensors: Sensors = EXACT,
     delay_s: float = 0.0,
 ) -> list[Driven]:
-    """Drives for ``duration_s`` in all, or longer, as each drive is to pass the whole line, until
-    one neither leaves the track nor spins; logs all drives at ``path``, as runs from the start
-    line.
+    """Drives for ``duration_s``, again until a drive neither leaves the track nor spins, and logs
+    this one at ``path``.
+
+    Where states are estimated all drives are logged, as runs from the start line, each up to where
+    it fails: ``duration_s`` is then that of all, or longer, as each is to pass the whole line.
 
     Each is slower than the one before, to the last of ten. With a ``speed_scale`` in ``settings``
     there is but one. ``sensors``, ``delay_s``: as in :class:`ClosedLoop`, the seed is that of
@@ -91,46 +94,55 @@ def collect(
     """
     followed = training_line(track, line, car, settings.style)
     room_m, speeds = room_beside(track, followed), followed.vx_mps
+    vehicle = vehicle or built_in_car(car)
 
     def pursuit() -> PurePursuit:
         return PurePursuit(car, followed.x_m, followed.y_m, speeds, settings, room_m=room_m)
 
     def watch(x: Sequence[float]) -> End | None:
-        return _FAILED if _failing(track, car, np.array([x]))[0] else None
+        return _FAILED if sensors.root and _failing(track, car, np.array([x]))[0] else None
 
     least_s = min(duration_s, _lap_length_s(car, line))
-    slowed, driven = np.ones(len(speeds)), list[Driven]()
-    log = LogWriter(path, {"collect": {"track": track.name, "car": car_text(car)}})
+    slowed, driven, log = np.ones(len(speeds)), list[Driven](), None
     try:
-        controller = PythonController(artefact, pursuit())
-        loop = ClosedLoop(
-            car, track, line, controller, vehicle or built_in_car(car), log,
-            sensors=sensors, seed=settings.seed, delay_s=delay_s,
-        )  # fmt: skip
         for _ in range(1 if settings.speed_scale else _ATTEMPTS):
-            left_s = duration_s - sum(float(one.time_s[-1]) for one in driven)
-            one = loop.drive(
-                0, max(left_s, least_s), start_speed_mps, name="pure-pursuit", watch=watch
-            )
+            if log is None or not sensors.root:
+                if log is not None:
+                    log.close()
+                log = LogWriter(path, {"collect": {"track": track.name, "car": car_text(car)}})
+                controller, driven = PythonController(artefact, pursuit()), []
+                loop = ClosedLoop(
+                    car, track, line, controller, vehicle, log,
+                    sensors=sensors, seed=settings.seed, delay_s=delay_s,
+                )  # fmt: skip
+            else:
+                controller.law = pursuit()
+            left_s = max(duration_s - sum(float(one.time_s[-1]) for one in driven), least_s)
+            one = loop.drive(0, left_s, start_speed_mps, name="pure-pursuit", watch=watch)
             driven.append(one)
             if one.end.reason == "plant_fault":
                 raise FmuFault(one.end.text)
-            wrong = _failing(track, car, one.x)
-            everywhere = one.fallbacks > _FALLBACK * len(one.levels)
-            if not wrong.any() and not everywhere:
+            slower, everywhere = _slower_after(one, followed, slowed)
+            if everywhere == slower.min() == 1:
                 break
-            slower = np.ones(len(speeds))
-            if wrong.any():
-                at = one.x[int(np.argmax(wrong))]
-                slower = slower_before(followed, at, car)
-                if slowed[_nearest(followed, at)] < 1:
-                    everywhere, slower = True, np.ones(len(speeds))
-            slowed = slower * slowed
-            speeds = (_EVERYWHERE if everywhere else 1.0) * slower * speeds
-            controller.law = pursuit()
+            slowed, speeds = slower * slowed, everywhere * slower * speeds
     finally:
-        log.close()
+        if log is not None:
+            log.close()
     return driven
+
+
+def _slower_after(one: Driven, line: RaceLine, slowed: Floats) -> tuple[Floats, float]:
+    """Shares of the line's speeds, (n,), and of all of them, with which the next drive is slower
+    than this one; ``slowed`` (n,): where it was slower than the first. Ones: it was good."""
+    same = np.ones(len(slowed))
+    lost = one.fallbacks > _FALLBACK * len(one.levels)
+    wrong = _failing(one.track, one.car, one.x)
+    if wrong.any():  # the first time: what comes after it may follow of it
+        at = one.x[int(np.argmax(wrong))]
+        if slowed[_nearest(line, at)] == 1:
+            return slower_before(line, at, one.car), _EVERYWHERE if lost else 1.0
+    return same, _EVERYWHERE if lost or wrong.any() else 1.0
 
 
 def _failing(track: Track, car: CarParameters, x: Floats) -> Flags:

@@ -2,6 +2,7 @@
 smoothed states."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,11 +11,13 @@ from bayesrace.arrays import Floats
 from bayesrace.gp.expression import evaluate_mean, kernel_matrix
 from bayesrace.gp.weights import GpOutput, GpWeights
 from bayesrace.integrators import PREDICTION
+from bayesrace.learning import conditioning
 from bayesrace.learning.conditioning import conditioned
 from bayesrace.learning.dataset import Dataset, concatenate
 from bayesrace.learning.drives import Drive, Estimates
+from bayesrace.learning.estimates import smoothed_again
 from bayesrace.learning.settings import TrainingSettings
-from bayesrace.learning.smoothing import corrected_steps, smooth
+from bayesrace.learning.smoothing import Smoothed, corrected_steps, smooth
 from bayesrace.learning.training import fit
 from bayesrace.learning.validation import predictive_sigma, residual
 from bayesrace.vehicles import CarParameters
@@ -158,8 +161,14 @@ def prior(
 
 @pytest.mark.parametrize("mirrored", [True, False])
 def test_it_is_what_all_readings_and_samples_at_once_say(
-    make: Make, car: CarParameters, weights: GpWeights, mirrored: bool
+    make: Make,
+    car: CarParameters,
+    weights: GpWeights,
+    mirrored: bool,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    """The covariance of the weights is made anew several times in the drive."""
+    monkeypatch.setattr(conditioning, "_LATER", 20)
     car = car.model_copy(update={"mirrored_samples": mirrored})
     x, u, drive = short_drive(make, car)
     found = smooth(drive, car, PREDICTION, weights)
@@ -186,6 +195,50 @@ def test_it_is_what_all_readings_and_samples_at_once_say(
         np.testing.assert_allclose(evaluate_mean(made, z), image, atol=1e-12)
     stated = latent(made, z)
     np.testing.assert_allclose(stated.mean(axis=0), variance.mean(axis=0), rtol=0.01)
+
+
+def two_drives(make: Make, car: CarParameters, weights: GpWeights) -> list[Dataset]:
+    """Smoothed, as samples."""
+    found = []
+    for begin in (0, 7):
+        x, u, drive = short_drive(make, car)
+        x, u = x[begin:], u[begin:]
+        kept = tuple(one for one in drive.readings if one.time_s > STEP_S * begin)
+        moved = replace(drive, time_s=drive.time_s[begin:], u=drive.u[begin:], readings=kept)
+        origin = np.column_stack([np.zeros(len(u), int), np.arange(len(u))])
+        known = Estimates(np.full((len(u), 4), 0.01), origin, (moved,))
+        found.append(Dataset(car, STEP_S, x[:-1], u, x[1:], estimates=known))
+    return [smoothed_again(one, PREDICTION, weights) for one in found]
+
+
+def test_the_order_of_drives_does_not_matter(
+    make: Make, car: CarParameters, weights: GpWeights
+) -> None:
+    drives = two_drives(make, car, weights)
+    z = np.vstack([one.features for one in drives])
+    there, back, first = (
+        evaluate_mean(conditioned(weights, concatenate(some), PREDICTION, 42, SHARE), z)
+        for some in (drives, drives[::-1], drives[:1])
+    )
+    np.testing.assert_allclose(there, back, atol=1e-6)
+    assert np.abs(there - first).max() > 1e-4
+
+
+def test_samples_of_a_drive_that_the_model_cannot_follow_stay_as_they_are(
+    make: Make, car: CarParameters, weights: GpWeights, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first, second = two_drives(make, car, weights)
+    both = concatenate([first, second])
+
+    def only_the_first(drive: Drive, *rest: Any) -> Smoothed | None:
+        return smooth(drive, *rest) if len(drive.time_s) > 10 else None
+
+    monkeypatch.setattr("bayesrace.learning.estimates.smooth", only_the_first)
+    found = smoothed_again(both, PREDICTION, weights).estimates
+    assert found is not None
+    assert len(found.drives) == 1
+    np.testing.assert_array_equal(found.origin[:, 0], np.repeat([0, -1], [len(first), len(second)]))
+    np.testing.assert_array_equal(found.deviation[len(first) :], second.deviation)
 
 
 def latent(weights: GpWeights, z: Floats) -> Floats:
