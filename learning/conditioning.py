@@ -32,19 +32,19 @@ import numpy as np
 from scipy.linalg import cholesky, solve_triangular
 from scipy.optimize import brentq
 
-from bayesrace.arrays import Flags, Floats, Rows
-from bayesrace.gp.expression import evaluate_mean, kernel_matrix
+from bayesrace.arrays import Floats, Rows
+from bayesrace.gp.expression import kernel_matrix
 from bayesrace.gp.weights import FEATURES, GpOutput, GpWeights
 from bayesrace.integrators import Discretisation
 from bayesrace.learning.dataset import MIRRORED_FEATURES, MIRRORED_OUTPUTS, Dataset
 from bayesrace.learning.drives import Drive, Estimates, Event, Measured
 from bayesrace.learning.smoothing import (
-    begins,
     blurred,
     corrected_steps,
     innovation,
     inputs_of,
     observation,
+    period_begins,
     started,
 )
 from bayesrace.learning.subset import evenly, most_informative
@@ -199,14 +199,6 @@ def _noise_for(output: GpOutput, inputs: Floats, z: Floats, wanted: float) -> fl
     return float(np.exp(brentq(excess, least, most, xtol=1e-3) if excess(most) > 0 else most))
 
 
-def _periods(events: Sequence[Event]) -> Rows:
-    """The number of the state that ends the period of each event but the first."""
-    numbers = np.array([one.period for one in events])
-    ends = np.flatnonzero(numbers >= 0)
-    following = np.minimum(np.searchsorted(ends, np.arange(1, len(events))), len(ends) - 1)
-    return np.asarray(numbers[ends[following]])
-
-
 class _Chain(NamedTuple):
     """The steps from each event to the next, linearised along a path."""
 
@@ -221,7 +213,9 @@ class _Chain(NamedTuple):
     phi: Sequence[Floats]
     """(n, M) of each output."""
     assumed: Floats
-    """Corrections (n, 3) that ``ahead`` was made with."""
+    """Corrections (n, 3) that ``ahead`` was made with, beside m."""
+    read: Sequence[Event]
+    """The events that the steps lead to."""
 
 
 class _Belief:
@@ -234,8 +228,8 @@ class _Belief:
         self._noise = noise_share * np.array([one.before.amplitudes[3] for one in bases])
         self._w, self._ww = np.zeros(count), np.eye(count)
         self._x, self._xx, self._xw = np.zeros(_NB), np.zeros((_NB, _NB)), np.zeros((_NB, count))
-        self._later: list[Floats] = []
-        """Rows R of which R' R is still to be taken from the covariance of w."""
+        self._later, self._count = np.zeros((_LATER + _NX, count)), 0
+        """The first rows R, of which R' R is still to be taken from the covariance of w."""
 
     def result(self) -> tuple[Floats, Floats]:
         """Mean (m,) and covariance (m, m) of w."""
@@ -271,12 +265,10 @@ class _Belief:
         if path is None:
             raise ValueError("the drive has not been smoothed")
         path = path[:, :_NB]
-        learned = np.isin(_periods(events) - 1, samples)
-        chain = self._chain(events, path, learned, car, discretisation, weights)
+        chain = self._chain(events, path, samples, car, discretisation, weights)
         self._x, self._xx = started(events[0], drive, car, path[0])
         self._xw[:] = 0
-        read = blurred(events, path, discretisation.step_s, weights)
-        for i, event in enumerate(read[1:]):
+        for i, event in enumerate(chain.read):
             if event.duration_s > 0:
                 self._x = chain.ahead[i] + chain.slope[i] @ (self._x - path[i])
                 self._predict(chain, i)
@@ -287,13 +279,16 @@ class _Belief:
         self,
         events: Sequence[Event],
         path: Floats,
-        learned: Flags,
+        samples: Rows,
         car: CarParameters,
         discretisation: Discretisation,
         weights: GpWeights,
     ) -> "_Chain":
-        columns, begin = inputs_of(events[1:]), begins(events, path)
-        u, h = columns[0].T, columns[1][0]
+        columns, rows = inputs_of(events[1:]), period_begins(events)
+        u, h, begin = columns[0].T, columns[1][0], path[rows, :_NX]
+        states = np.array([one.period for one in events])
+        states[0] = states[states >= 0][0] - 1  # the first pose is within the period after it
+        learned = np.isin(states[rows], samples)
         step = corrected_steps(path[:-1, :_NX], begin, u, h, car, discretisation, weights)
         z, share = np.column_stack([begin[:, 3:], u]), h / discretisation.step_s
         phi = [learned[:, None] * basis.at(z) for basis in self._bases]
@@ -307,18 +302,18 @@ class _Belief:
         slope[:, :_NX, :_NX], by_g[:, :_NX] = step.slope, step.by_error * share[:, None, None]
         ahead = path[:-1].copy()
         ahead[:, :_NX] = step.ahead
-        return _Chain(ahead, slope, by_g, noise, phi, evaluate_mean(weights, z))
+        assumed = step.residual - [basis.offset for basis in self._bases]
+        read = blurred(events, step.residual, discretisation.step_s)[1:]
+        return _Chain(ahead, slope, by_g, noise, phi, assumed, read)
 
     def _predict(self, chain: "_Chain", i: int) -> None:
         """The covariance after a step, and the mean by w in place of what was assumed."""
         slope, by_g = chain.slope[i], chain.by_g[i]
         pairs = [(phi[i], part) for phi, part in zip(chain.phi, self.parts, strict=True)]
-        offsets = [basis.offset for basis in self._bases]
-        g = np.array([one @ self._w[part] for one, part in pairs]) + offsets
+        g = np.array([one @ self._w[part] for one, part in pairs])
         gw = np.array([one @ self._ww[part] for one, part in pairs])
-        if self._later:
-            rows = np.vstack(self._later)
-            gw -= np.array([rows[:, part] @ one for one, part in pairs]) @ rows
+        later = self._later[: self._count]
+        gw -= np.array([later[:, part] @ one for one, part in pairs]) @ later
         gx = np.array([self._xw[:, part] @ one for one, part in pairs])
         gg = np.array([gw[:, part] @ one for one, part in pairs])
         across = slope @ gx.T @ by_g.T
@@ -337,12 +332,12 @@ class _Belief:
         self._w += by_w.T @ white
         self._xx -= by_x.T @ by_x
         self._xw -= by_x.T @ by_w
-        self._later.append(by_w)
-        if sum(map(len, self._later)) >= _LATER:
+        self._later[self._count : self._count + len(by_w)] = by_w
+        self._count += len(by_w)
+        if self._count >= _LATER:
             self._settle()
 
     def _settle(self) -> None:
-        if self._later:
-            rows = np.vstack(self._later)
-            self._ww -= rows.T @ rows
-            self._later.clear()
+        later = self._later[: self._count]
+        self._ww -= later.T @ later
+        self._count = 0

@@ -18,10 +18,9 @@ velocities, and these are twice integrated random walks in the car's frame (whit
 makes the readings most likely. The nominal model would bend the velocities to its own error, which
 is just what is to be learned. Its gate is that of the C code, but for a reading after five of its
 instrument that were refused, and for a random walk that is noisier still: what it has refused is
-left out for good. **With weights** it is the
-corrected model, with the variance that the weights state and the walk of ``car.tuning.estimator``,
-linearised along the first result; it has no gate, since where its weights know nothing it would
-refuse what is to be learned.
+left out for good. **With weights** it is the corrected model, with the variance that the weights
+state and the walk of ``car.tuning.estimator``, linearised along the first result; it has no gate,
+since where its weights know nothing it would refuse what is to be learned.
 
 Steering that no instrument reads is what was commanded, from what is known of it at the start: at a
 run's the wheels are straight, later the controller's estimate is as good as it states.
@@ -38,7 +37,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from bayesrace.arrays import Flags, Floats, Rows
-from bayesrace.gp.expression import evaluate_mean, mean_function
+from bayesrace.gp.expression import mean_function
 from bayesrace.gp.weights import GpWeights
 from bayesrace.integrators import Discretisation, pose_from_velocities
 from bayesrace.learning.drives import POSE, Drive, Event, Measured
@@ -46,8 +45,8 @@ from bayesrace.learning.validation import NOMINAL, predictive_sigma
 from bayesrace.vehicles.parameters import CarParameters
 from bayesrace.vehicles.parts import GRAVITY_MPS2
 
-__all__ = ["Smoothed", "Steps", "begins", "blurred", "corrected_steps", "innovation", "inputs_of"]
-__all__ += ["observation", "smooth", "started"]
+__all__ = ["Smoothed", "Steps", "blurred", "corrected_steps", "innovation", "inputs_of"]
+__all__ += ["observation", "period_begins", "smooth", "started"]
 
 _NX: Final = 7
 _NB: Final = 9
@@ -233,9 +232,8 @@ def smooth(
         path, drive = walked.path, replace(drive, refused=walked.refused)
         events = drive.events
     for _ in range(_LINEARISED):
-        model = _corrected(events, path[:, :_NB], car, discretisation, weights)
+        model, read = _corrected(events, path[:, :_NB], car, discretisation, weights)
         x0, p0 = started(events[0], drive, car, path[0, :_NB])
-        read = blurred(events, path, discretisation.step_s, weights)
         try:
             with np.errstate(over="ignore", invalid="ignore"):
                 found = _backward(read, _forward(read, x0[None], p0[None], model, gate=0))
@@ -287,32 +285,26 @@ def _stacked(matrix: Any, count: int) -> Floats:
     return array.reshape(len(array), count, -1).transpose(1, 0, 2)
 
 
-def begins(events: Sequence[Event], path: Floats) -> Floats:
-    """Where the period of each event but the first has begun, (e - 1, 7), on ``path`` (e, 7 or
-    more)."""
+def period_begins(events: Sequence[Event]) -> Rows:
+    """The event at which the period of each event but the first has begun, (e - 1,)."""
     ends = [i if i == 0 or one.period >= 0 else 0 for i, one in enumerate(events[:-1])]
-    return path[np.maximum.accumulate(ends), :_NX]
+    return np.maximum.accumulate(ends)
 
 
-def blurred(
-    events: Sequence[Event], path: Floats, step_s: float, weights: GpWeights
-) -> list[Event]:
+def blurred(events: Sequence[Event], residual: Floats, step_s: float) -> list[Event]:
     """Readings of velocities with what the corrected model errs by within periods in their
-    variance.
+    variance. ``residual`` (e - 1, 3): of the period of each event but the first.
 
     The residual acts evenly in a period, though it changes from one to the next: by dg, as if it
     were linear in time, it has left out dg tau (1 - tau) / 2 after a share tau of the period.
     """
-    u, h = inputs_of(events[1:])
-    period = np.cumsum([0, *(one.period >= 0 for one in events[1:-1])])
-    first = np.searchsorted(period, np.arange(period[-1] + 1))
+    first, period = np.unique(period_begins(events), return_inverse=True)
     if len(first) < 2:
         return list(events)
-    residual = evaluate_mean(weights, np.column_stack([begins(events, path)[:, 3:], u.T])[first])
-    passed = np.cumsum(h[0])
+    passed = np.cumsum([one.duration_s for one in events[1:]])
     ended = passed[np.append(first[1:] - 1, -1)][period]
     tau = np.clip(1 - (ended - passed) / step_s, 0, 1)
-    error = np.gradient(residual, axis=0)[period] * (tau * (1 - tau) / 2)[:, None]
+    error = np.gradient(residual[first], axis=0)[period] * (tau * (1 - tau) / 2)[:, None]
     found = [events[0]]
     for event, by in zip(events[1:], error, strict=True):
         if (one := event.measured) is not None and {3, 4, 5} & set(one.states):
@@ -328,10 +320,11 @@ def _corrected(
     car: CarParameters,
     discretisation: Discretisation,
     weights: GpWeights,
-) -> _Transition:
-    """The corrected model, linearised along the path."""
+) -> tuple[_Transition, list[Event]]:
+    """The corrected model, linearised along the path, and the events with readings as noisy as it
+    takes them."""
     before, (u, h), e = path[:-1], inputs_of(events[1:]), len(events) - 1
-    begin = begins(events, path)
+    begin = path[period_begins(events), :_NX]
     step = corrected_steps(before[:, :_NX], begin, u.T, h[0], car, discretisation, weights)
     z, period = _periods(begin, u.T)
     sigma = predictive_sigma(weights, z)[period]
@@ -347,7 +340,7 @@ def _corrected(
     def go(i: int, x: Floats) -> tuple[Floats, Floats, Floats]:
         return after[i - 1] + (x - before[i - 1]) @ f[i - 1].T, f[i - 1], q[i - 1]
 
-    return go
+    return go, blurred(events, step.residual, discretisation.step_s)
 
 
 def _periods(begin: Floats, u: Floats) -> tuple[Floats, Rows]:
@@ -365,6 +358,8 @@ class Steps(NamedTuple):
     """(n, 7, 7), by the states."""
     by_error: Floats
     """(n, 7, 3), by the errors of a step."""
+    residual: Floats
+    """(n, 3), of the whole periods."""
 
 
 def corrected_steps(
@@ -389,17 +384,17 @@ def corrected_steps(
         found = mean_function(weights)(features)
         at = ca.Function("gp", [features], [found, ca.densify(ca.jacobian(found, features))])
         means, gradients = at(z.T)
-        mean = share[:, None] * np.asarray(means).T[period]
+        mean = np.asarray(means).T[period]
         gradient = share[:, None, None] * _stacked(gradients, len(z))[period]
     one, v, e = ca.SX.sym("x", 7), ca.SX.sym("u", 2), ca.SX.sym("e", 3)
     part = ca.SX.sym("h")
     next_x = discretisation.over(NOMINAL(car))(one, v, e, part)
     results = [next_x, *(ca.densify(ca.jacobian(next_x, by)) for by in (one, e))]
     step = ca.Function("step", [one, v, part, e], results)
-    ahead, by_x, by_e = step(x.T, u.T, h[None], mean.T)
+    ahead, by_x, by_e = step(x.T, u.T, h[None], share * mean.T)
     slope, by_error = _stacked(by_x, count), _stacked(by_e, count)
     slope[:, :, 3:] += by_error @ gradient[:, :, :4]
-    return Steps(np.asarray(ahead).T, slope, by_error)
+    return Steps(np.asarray(ahead).T, slope, by_error, mean)
 
 
 def _walk() -> ca.Function:

@@ -123,7 +123,7 @@ def collect(
             if one.end.reason == "plant_fault":
                 raise FmuFault(one.end.text)
             slower, everywhere = _slower_after(one, followed, slowed)
-            if everywhere == slower.min() == 1:
+            if everywhere == 1 and slower.min() == 1:
                 break
             slowed, speeds = slower * slowed, everywhere * slower * speeds
     finally:

@@ -11,10 +11,10 @@
  * scaled. This is a Bayesian linear regression that forgets (Bishop, "Pattern Recognition and
  * Machine Learning", 2006, section 3.3): weights are N(0, s^2 I) before anything is seen, in units
  * of the deviations that the problem names, and s^2 follows the evidence (3.5), so that a model
- * that is right is left as it is. After bends to the left alone a term that has the same sign in
- * both directions cannot be told from one that changes it. So terms that change their sign in a
- * mirror where the output does not, or the other way round, have smaller weights. Several
- * surprising errors in a row make older ones be forgotten.
+ * that is right is left as it is. Bends to the left alone do not show which sign a term has in
+ * bends to the right. So terms that change their sign in a mirror where the output does not, or the
+ * other way round, have smaller weights. Several surprising errors in a row make older ones be
+ * forgotten.
  *
  * The plan's model becomes F + F_e w' phi, and the residual's variance there the posterior's
  * without noise, plus phi' P phi with P the covariance of w, plus what the regression does not
