@@ -320,21 +320,21 @@ class NativeProblem:
         u: Floats,
         duration_s: float,
         x_next: Floats,
-        noise: Floats | None = None,
+        step_variance: Floats | None = None,
     ) -> None:
         """What the car did between two measured states (nx,), under u (nu,) on average.
 
         With caution, what the corrected model errs by is estimated, and corrected from then on.
-        ``noise`` (2, nx), where the states are estimates: the variances in br_mpc_noise.
+        ``step_variance`` (nx,), of states that are estimates: by which their step differs from the
+        car's. Of the mismatch they say nothing: an estimator has more to say (br_mpc_noise).
         InputError for a duration that is not above 0 and at most 1, or numbers that are not finite.
         """
         given = self._given("x", x, self._nx), self._given("u", u, self._nu)
         after = self._given("x_next", x_next, self._nx)
-        variances = self._ffi.NULL
-        if noise is not None:
-            given_noise = self._given("noise", noise, 2, self._nx)
-            variances = self._ffi.cast("br_mpc_noise *", given_noise)
-        error = self._library.br_mpc_observe(self.handle, *given, duration_s, after, variances)
+        noise = self._ffi.NULL
+        if step_variance is not None:
+            noise = self._ffi.new("br_mpc_noise *", {"step": step_variance.tolist()})
+        error = self._library.br_mpc_observe(self.handle, *given, duration_s, after, noise)
         self._check(error, "observe")
 
     def prepare(self, elapsed_s: float | None = None, budget_s: float = 0.0) -> None:

@@ -36,13 +36,13 @@ class Estimator:
         self,
         time_s: float,
         u: Floats,
-        residual: tuple[Floats, Floats],
+        residual: tuple[Floats, Floats, Floats],
         measured: Sequence[Measurement],
     ) -> bool:
         """The period that ends at ``time_s`` is over; whether anything is known yet.
 
-        ``u`` (nu,) acted in it; ``residual``: its variance (ne,), per stage, and that of its noise.
-        InputError for a time before the last one.
+        ``u`` (nu,) acted in it; ``residual``: its variance (ne,), per stage, that of its noise, and
+        the terms of its mismatch (nphi,). InputError for a time before the last one.
         """
         given = self._ffi.new("br_measurement[]", len(measured))
         fill(given, measured)
@@ -55,6 +55,27 @@ class Estimator:
             return False
         self._check(error, "estimator")
         return True
+
+    def correct(self, weight: Floats, covariance: Floats | None = None) -> None:
+        """Weights (ne, nphi) of the mismatch from now on, and each output's (nphi, nphi)."""
+        given = self._ffi.new("br_mpc_mismatch *")
+        given.phi[0] = 1.0
+        given.weight = weight.tolist()
+        if covariance is not None:
+            roots = np.linalg.cholesky(np.linalg.inv(covariance))
+            for root in roots:
+                np.fill_diagonal(root, 1 / np.diag(root))
+            given.factor = roots.tolist()
+        self._check(self._library.br_estimator_correct(self.handle, given), "mismatch")
+
+    def shown(self) -> tuple[Floats, Floats, Floats]:
+        """What the last period has shown of the mismatch: information (ne,), error (ne,) and terms
+        (ne, nphi), the latter two weighted with it."""
+        self.read()
+        noise = self._belief.noise
+        parts = (noise.information, noise.error, noise.phi)
+        information, error, phi = (np.frombuffer(self._ffi.buffer(one), float) for one in parts)
+        return information.copy(), error.copy(), phi.reshape(len(error), -1).copy()
 
     def read(self) -> Belief:
         """At the end of the last period; InputError while nothing is known."""

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.linalg import block_diag
 
 from bayesrace.arrays import Floats
 from bayesrace.codegen.build import build
@@ -45,7 +46,14 @@ LAG_S, UNDERSTEER = 0.08, 0.008
 WHEELBASE_M = get_car("orca").wheelbase_m
 VARIANCE = np.array([4e-6, 9e-6, 4e-3])
 NOISE = VARIANCE * (0.1, 0.4, 0.25)
-RESIDUAL = VARIANCE, NOISE
+NO_TERMS = np.zeros(10)
+RESIDUAL = VARIANCE, NOISE, NO_TERMS
+TERMS = np.r_[1, np.zeros(9)]
+"""Of a mismatch that is the same everywhere."""
+MISMATCH = np.array([1e-3, 3e-3, 0.05])
+"""It is so large, ..."""
+UNCERTAIN = MISMATCH / 3
+"""... with these standard deviations."""
 TURN, SHIFT = 0.05, 0.01
 """Offsets of yaw rate and steering angle as measured."""
 
@@ -68,15 +76,27 @@ class Textbook:
     p: Floats
     time_s: float
     acceleration: Floats
+    mismatch: Floats
+    uncertain: Floats
+    """Standard deviations of the mismatch."""
+    extra: Floats
+    """How x errs with the mismatch (12, 3), which p does not know of."""
     squared: list[float] = field(default_factory=list)
     way: Floats = field(default_factory=lambda: np.zeros(7))
     """Since the beginning of the period, whose residual counts in all its parts."""
 
     @classmethod
-    def begun(cls, step: NativeStep, first: Measurement, acceleration: Floats) -> "Textbook":
+    def begun(
+        cls,
+        step: NativeStep,
+        first: Measurement,
+        acceleration: Floats,
+        mismatch: tuple[Floats, Floats],
+    ) -> "Textbook":
         p = np.diag(np.r_[START, acceleration] ** 2)
         p[:3, :3] = np.diag(np.square(first.deviation))
-        return cls(step, np.r_[first.value, np.zeros(9)], p, first.time_s, acceleration)
+        x = np.r_[first.value, np.zeros(9)]
+        return cls(step, x, p, first.time_s, acceleration, *mismatch, np.zeros((12, 3)))
 
     def reach(self, time_s: float, u: Floats) -> None:
         if abs(np.remainder(self.time_s + TS / 2, TS) - TS / 2) < 1e-9:  # a period begins
@@ -84,35 +104,50 @@ class Textbook:
         left = time_s - self.time_s
         while left > 1e-9:
             h = min(left, TS)
-            f, x, left_of = np.eye(12), self.x[:7].copy(), np.exp(-h / FADING_S)
+            n, x, left_of = len(self.x), self.x[:7].copy(), np.exp(-h / FADING_S)
+            f, q = np.eye(n), np.zeros((n, n))
             lacking = self.acceleration**2 + 4 * (VARIANCE - 2 * NOISE) / TS**2
-            q = np.diag(np.r_[h * DRIFT**2, (1 - left_of**2) * lacking])
+            q[range(12), range(12)] = np.r_[h * DRIFT**2, (1 - left_of**2) * lacking]
             if self.acceleration.any():
                 go = partial(walked, u=u, h=h, speed=model_speed(self.step, x, u, h))
                 added, f, self.x = np.zeros((7, 7)), derivatives(go, self.x), go(self.x)
             else:
-                after = self.step.propagate(x, u, h, 2 * NOISE, x - self.way, self.x[9:])
-                self.x[:7], f[:7, :7], f[:7, 9:], added = after
-                self.x[9:] *= left_of
-                f[9:, 9:] *= left_of
+                own = self.mismatch + np.array([0, 0, self.x[12:].sum()])
+                beside = self.x[9:12] + own / TS
+                after = self.step.propagate(x, u, h, 2 * NOISE, x - self.way, beside)
+                self.x[:7], f[:7, :7], f[:7, 9:12], added = after
+                f[:7, 12:] = after[2][:, 2:3] / TS
+                self.x[9:12] *= left_of
+                f[9:12] *= left_of
             self.way = self.way + self.x[:7] - x
             q[:7, :7] += added
+            self.extra = f[:12, :12] @ self.extra
+            if not self.acceleration.any():
+                self.extra[:7] += after[2] / TS
             self.p = f @ self.p @ f.T + q
             left -= h
         self.time_s = time_s
 
     def take(self, m: Measurement) -> None:
-        h = np.zeros((len(m.of), 12))
+        h = np.zeros((len(m.of), len(self.x)))
         h[range(len(m.of)), m.of] = 1
         h[:, 7] += h[:, 5]
         h[:, 8] += h[:, 6]
         new = np.asarray(m.value) - h @ self.x
-        s = h @ self.p @ h.T + np.diag(np.square(m.deviation))
+        noise = np.diag(np.square(m.deviation))
+        s = h @ self.p @ h.T + noise
         gain = self.p @ h.T @ np.linalg.inv(s)
-        self.squared.append(float(new @ np.linalg.solve(s, new)))
+        total = h[:, :12] @ self.all @ h[:, :12].T + noise
+        self.squared.append(float(new @ np.linalg.solve(total, new)))
         self.x = self.x + gain @ new
-        left = np.eye(12) - gain @ h
-        self.p = left @ self.p @ left.T + gain @ np.diag(np.square(m.deviation)) @ gain.T
+        left = np.eye(len(self.x)) - gain @ h
+        self.extra = left[:12, :12] @ self.extra
+        self.p = left @ self.p @ left.T + gain @ noise @ gain.T
+
+    @property
+    def all(self) -> Floats:
+        """The covariance with that of the mismatch."""
+        return self.p[:12, :12] + self.extra @ np.diag(self.uncertain**2) @ self.extra.T
 
 
 def model_speed(step: NativeStep, at: Floats, u: Floats, h: float) -> Callable[[Floats], Any]:
@@ -180,7 +215,11 @@ def drive(car: CarParameters, make: Make) -> Drive:
 
 
 def estimated(
-    estimator: Estimator, drive: Drive, late: int = 0, poses_first: bool = False
+    estimator: Estimator,
+    drive: Drive,
+    late: int = 0,
+    poses_first: bool = False,
+    terms: Floats = NO_TERMS,
 ) -> Belief:
     """Poses but the first come so many periods late, with what the others measure then."""
     for k, u in enumerate(drive.u):
@@ -188,14 +227,20 @@ def estimated(
         then = drive.measured[max(k - late, 0)] if k in (0, *range(late + 1, len(drive.u))) else []
         poses = [one for one in then if one.instrument == POSE]
         measured = poses + here if poses_first else here + poses
-        estimator.advance(TS * (k + 1), u, RESIDUAL, measured)
+        estimator.advance(TS * (k + 1), u, (VARIANCE, NOISE, terms), measured)
     return estimator.read()
 
 
 def textbook(
-    step: NativeStep, drive: Drive, late: int = 0, acceleration: Floats = MODEL
+    step: NativeStep,
+    drive: Drive,
+    late: int = 0,
+    acceleration: Floats = MODEL,
+    mismatch: tuple[Floats, Floats] = (np.zeros(3), np.zeros(3)),
+    joint: tuple[float, float] | None = None,
 ) -> Textbook:
-    """What has been measured by the end of the drive."""
+    """What has been measured by the end of the drive. ``joint``: mean and standard deviation
+    of what the yaw rate's residual errs by, which is a state, too."""
     last = len(drive.u) - late
     events = [
         (one.time_s, k, one)
@@ -205,7 +250,9 @@ def textbook(
     ]
     events.sort(key=lambda event: event[0])
     first = next(one for _, _, one in events if one.instrument == POSE)
-    made = Textbook.begun(step, first, acceleration)
+    made = Textbook.begun(step, first, acceleration, mismatch)
+    if joint:
+        made.x, made.p = np.r_[made.x, joint[0]], block_diag(made.p, joint[1] ** 2)
     for time_s, k, one in events:
         if time_s <= first.time_s:
             continue
@@ -264,20 +311,54 @@ def test_it_is_the_textbook_filter_with_all_in_order(
     make: Make, drive: Drive, late: int, poses_first: bool, acceleration: Floats
 ) -> None:
     """Asynchronous instruments, offsets, and measurements that come late: as late as 64 events
-    reach back, when what comes with them makes these the oldest. With and without the model."""
+    reach back, when what comes with them makes these the oldest. With the model, which errs by a
+    mismatch that is known to some deviations, and without."""
     step = make()
     made = estimator(step, acceleration=acceleration)
-    expected = textbook(step, drive, late, acceleration)
-    found = estimated(made, drive, late, poses_first)
+    known = not acceleration.any()
+    mismatch = (MISMATCH, UNCERTAIN) if known else (np.zeros(3), np.zeros(3))
+    if known:
+        made.correct(np.outer(MISMATCH, TERMS), np.array([v**2 * np.eye(10) for v in UNCERTAIN]))
+    expected = textbook(step, drive, late, acceleration, mismatch)
+    found = estimated(made, drive, late, poses_first, TERMS if known else NO_TERMS)
     assert made.instrument(POSE).lost == 0
     assert found.time_s == pytest.approx(TS * len(drive.u))
     assert found.x == pytest.approx(expected.x[:9], rel=1e-9, abs=1e-11)
-    p = expected.p[:9, :9]
+    p = expected.all[:9, :9]
     scale = np.sqrt(np.outer(np.diag(p), np.diag(p)))
     assert np.abs((found.covariance - p) / scale).max() < 1e-8
+    if known:
+        assert np.abs((expected.p[:9, :9] - p) / scale).max() > 0.01
     if not late:
         squared = sum(made.instrument(number).squared for number in range(4))
         assert squared == pytest.approx(sum(expected.squared), rel=1e-8)
+
+
+def test_a_mismatch_is_what_a_filter_of_state_and_mismatch_finds(make: Make, drive: Drive) -> None:
+    """Whose states are those of both. It is learned from what is new in each measurement, and what
+    was estimated before moves with it. To first order: the model is not linear."""
+    step, wrong, deviation = make(), 0.1, 0.3
+    made = estimator(step)
+    made.correct(np.outer([0, 0, wrong], TERMS))
+    information = error = 0.0
+    for k, u in enumerate(drive.u):
+        made.advance(TS * (k + 1), u, (VARIANCE, NOISE, TERMS), drive.measured[k])
+        shown = made.shown()
+        information += shown[0][2]
+        error += shown[1][2]
+        assert shown[2][2] == pytest.approx(shown[0][2] * TERMS)
+    before = made.read()
+    posterior = 1 / (information + deviation**-2)
+    weight, covariance = np.zeros((3, 10)), np.array([1e-12 * np.eye(10)] * 3)
+    weight[2, 0] = posterior * (error + wrong / deviation**2)
+    covariance[2, 0, 0] = posterior
+    made.correct(weight, covariance)
+    found, joint = made.read(), textbook(step, drive, joint=(wrong, deviation))
+    assert posterior < deviation**2 / 10
+    assert weight[2, 0] == pytest.approx(joint.x[12], abs=0.03 * np.sqrt(posterior))
+    assert posterior == pytest.approx(joint.p[12, 12], rel=0.06)
+    moved = joint.x[:9] - before.x
+    assert np.abs(found.x - joint.x[:9]).max() < 0.05 * np.abs(moved).max()
 
 
 EVENTS = 64
@@ -400,7 +481,7 @@ def errors(
         if (then := k - late) >= 1 and then % every == 0:
             measured = [noisy(random, of_pose(TS * then, x[then], *noise))]
         known = np.r_[made.read().x[:7] if off else x[k - 1], u[k - 1]]
-        if not made.advance(TS * k, u[k - 1], step.variance(known), measured):
+        if not made.advance(TS * k, u[k - 1], (*step.variance(known), NO_TERMS), measured):
             continue
         found = made.read()
         error = found.x[:6] - x[k, :6]

@@ -128,7 +128,8 @@ def regressed(phi: Floats, y: Floats, r: Floats, odd: bool) -> tuple[Floats, Var
         excess = float((age * (taken - phi[:n] @ weights) ** 2 / r[:n]).sum() / age.sum())
     information = (phi.T * age / r / scale) @ phi
     covariance = np.linalg.inv(information + np.diag(1 / (prior * share)))
-    unexplained = float(age.sum() / (age / r).sum()) * max(excess - 1.5, 0)
+    chance = 2 * float(np.sqrt(2 / age.sum()))
+    unexplained = float(age.sum() / (age / r).sum()) * max(excess - 1.5 - chance, 0)
 
     def variance(at: Floats) -> float:
         of_weights = float(at @ covariance @ at)

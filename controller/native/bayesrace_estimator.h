@@ -70,10 +70,11 @@ typedef struct {
                   * 1,000 exceeds (chi-squared); 0: none is */
 } br_estimation;
 
-/* How uncertain the residual is, variances per stage: noise is that part of it which was not
- * explained in training. */
+/* The residual at the beginning of a period, per stage: how uncertain it is, where noise is that
+ * part of the variance which was not explained in training, and the terms of its mismatch
+ * (br_mpc_mismatch). */
 typedef struct {
-    double variance[BR_NE], noise[BR_NE];
+    double variance[BR_NE], noise[BR_NE], phi[BR_NPHI];
 } br_residual;
 
 /* State with its covariance. */
@@ -81,8 +82,7 @@ typedef struct {
     double time_s;
     double x[BR_NB];
     double covariance[BR_NB * BR_NB];
-    double corrected[BR_NX]; /* variances of what the period's measurements made of the prediction
-                              * from the period before: for br_mpc_observe */
+    br_mpc_noise noise; /* of the last period: for br_mpc_observe */
 } br_belief;
 
 /* What has become of one instrument's measurements. */
@@ -118,6 +118,10 @@ BR_API br_mpc_error br_estimator_set(br_estimator *estimator, const br_estimatio
 
 /* Knows nothing any more, and believes all instruments; counts stay. */
 BR_API void br_estimator_reset(br_estimator *estimator);
+
+/* The weights of the mismatch, from now on. What was estimated is what it would be if they had been
+ * known before, to first order. */
+BR_API br_mpc_error br_estimator_correct(br_estimator *estimator, const br_mpc_mismatch *mismatch);
 
 /* The period that ends at time_s is over: u acted in it, and so much has been measured, in it or
  * before. residual: NULL: 0. It begins with a position and heading that are measured together, and

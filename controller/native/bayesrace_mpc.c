@@ -143,15 +143,18 @@ br_mpc_error br_mpc_observe(br_mpc *mpc, const double x[BR_NX], const double u[B
         !br_plausible(u, BR_INPUT_LIMIT, BR_NU))
         return BR_ERROR_STATE;
     for (int i = 0; noise && i < BR_NX; ++i)
-        if (!(noise->corrected[i] >= 0 && noise->step[i] >= 0 &&
-              isfinite(noise->corrected[i] + noise->step[i])))
+        if (!(noise->step[i] >= 0 && isfinite(noise->step[i]))) return BR_ERROR_STATE;
+    for (int j = 0; noise && j < BR_NE; ++j)
+        if (!(noise->information[j] >= 0 && isfinite(noise->information[j] + noise->error[j]) &&
+              br_all_finite(noise->phi[j], BR_NPHI)))
             return BR_ERROR_STATE;
     br_transition *newest = &mpc->mismatch.newest;
     newest->duration = duration_s;
     memcpy(newest->x, x, sizeof newest->x);
     memcpy(newest->u, u, sizeof newest->u);
     memcpy(newest->x_next, x_next, sizeof newest->x_next);
-    newest->noise = noise ? *noise : (br_mpc_noise){{0}, {0}};
+    newest->estimated = noise != NULL;
+    newest->noise = noise ? *noise : (br_mpc_noise){{0}, {0}, {0}, {{0}}};
     mpc->watch.newest = *newest;
     return BR_OK;
 }
@@ -241,6 +244,11 @@ br_mpc_error br_mpc_steer(const br_mpc *mpc, const double x[BR_NX], double *s_m,
 br_mpc_error br_mpc_variance(br_mpc *mpc, const double v[BR_NV], double variance[BR_NE],
                              double noise[BR_NE]) {
     return mpc ? mpc->code->variance(mpc, v, variance, noise) : BR_ERROR_NULL;
+}
+
+br_mpc_error br_mpc_get_mismatch(const br_mpc *mpc, const double v[BR_NV],
+                                 br_mpc_mismatch *mismatch) {
+    return mpc ? mpc->code->mismatch(mpc, v, mismatch) : BR_ERROR_NULL;
 }
 
 br_mpc_error br_mpc_evaluate(const br_mpc *mpc, const double v[BR_NV], const double lambda[BR_NX],

@@ -146,11 +146,25 @@ typedef struct {
  * weights are compared while they are watched. */
 enum { BR_SAMPLES = 512, BR_WATCHED = 100 };
 
-/* Variances where the states before and after a step are estimates. */
+enum { BR_NPHI = 1 + BR_NZ + BR_NE }; /* terms of the mismatch: see br_mismatch.c */
+
+/* Where the states before and after a step are estimates. Sums over the measurements between them,
+ * weighted by what each says of an output's mismatch (information, of one that is the same
+ * everywhere): of the error that it shows, and of the terms that this is the error at, which are
+ * those of the last stages. */
 typedef struct {
-    double corrected[BR_NX]; /* of x_next from its prediction, where the model is right */
-    double step[BR_NX];      /* of the estimated step from the car's, whatever the model */
+    double step[BR_NX]; /* variance of the estimated step from the car's, whatever the model */
+    double information[BR_NE], error[BR_NE], phi[BR_NE][BR_NPHI];
 } br_mpc_noise;
+
+/* The mismatch of the weights that states are estimated by: w' phi for each output, per stage. */
+typedef struct {
+    double phi[BR_NPHI];           /* at the car's state and input; all 0: it is not estimated */
+    double unexplained[BR_NE];     /* there, the variance of what no weights explain */
+    double weight[BR_NE][BR_NPHI]; /* mean of w */
+    double factor[BR_NE][BR_NPHI][BR_NPHI]; /* Cholesky factor of its inverse covariance, with the
+                                             * reciprocals of its diagonal; 0: w is known */
+} br_mpc_mismatch;
 
 /* How the weights in use do beside others: root mean square errors per stage, beyond what the
  * noise of estimates explains. */
@@ -377,6 +391,11 @@ BR_API br_instructions br_mpc_get_instructions(const br_mpc *mpc);
  * anything. */
 BR_API br_mpc_error br_mpc_variance(br_mpc *mpc, const double v[BR_NV], double variance[BR_NE],
                                     double noise[BR_NE]);
+
+/* What the corrected model errs by, as it is estimated from br_mpc_observe, at v; 0 without caution
+ * and while estimates are by other weights than those in use. */
+BR_API br_mpc_error br_mpc_get_mismatch(const br_mpc *mpc, const double v[BR_NV],
+                                        br_mpc_mismatch *mismatch);
 
 /* Corrected model of the plan, with its mismatch, at v = [x; u]: x_next, J = d x_next / d v (row
  * major) and H = sum_i lambda_i d^2 x_next_i / d v^2. */

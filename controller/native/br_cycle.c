@@ -192,7 +192,9 @@ static void believe(br_cycle *cycle, double interval_s) {
 static br_fault doubtful(br_cycle *cycle, const br_estimate *now) {
     const double tolerance = fmax(cycle->settings.sensor_tolerance, 1);
     const double most_m = tolerance * BR_MONITOR_POSITION_M;
-    const double spread = now->p[BR_INDEX_X][BR_INDEX_X] + now->p[BR_INDEX_Y][BR_INDEX_Y];
+    double p[BR_NA][BR_NA];
+    br_estimator_covariance(&cycle->estimator, now, p);
+    const double spread = p[BR_INDEX_X][BR_INDEX_X] + p[BR_INDEX_Y][BR_INDEX_Y];
     int contradicted;
     const br_fault found = br_estimator_blind(&cycle->estimator, &contradicted);
     const int unknown = spread > most_m * most_m;
@@ -211,15 +213,21 @@ static void report(br_cycle *cycle) {
     counters->faults[counters->fault] += counters->fault != BR_FAULT_NONE;
 }
 
-/* The residual's variance where the car is, for the next estimate. */
+/* The residual where the car is, for the next estimate. */
 static void foresee(br_cycle *cycle) {
     if (cycle->has_residual || cycle->unknown || !cycle->mpc || !cycle->estimator.count) return;
     double v[BR_NV];
     br_residual *residual = &cycle->residual;
+    br_mpc_mismatch mismatch;
     memcpy(v, br_estimator_now(&cycle->estimator)->x, BR_NX * sizeof(double));
     memcpy(v + BR_NX, cycle->decision.u, BR_NU * sizeof(double));
     cycle->has_residual =
-        br_mpc_variance(cycle->mpc, v, residual->variance, residual->noise) == BR_OK;
+        br_mpc_variance(cycle->mpc, v, residual->variance, residual->noise) == BR_OK &&
+        br_mpc_get_mismatch(cycle->mpc, v, &mismatch) == BR_OK &&
+        br_estimator_correct(&cycle->estimator, &mismatch) == BR_OK;
+    if (!cycle->has_residual) return;
+    memcpy(residual->phi, mismatch.phi, sizeof residual->phi);
+    for (int j = 0; j < BR_NE; ++j) residual->variance[j] += mismatch.unexplained[j];
 }
 
 /* Over the periods whose states were lost, by the inputs that had been sent. */
@@ -255,7 +263,7 @@ static int estimate(br_cycle *cycle, const br_measured *before, br_mpc_noise *no
     cycle->doubt = BR_FAULT_NONE;
     if (!error) {
         const br_estimate *now = br_estimator_now(estimator);
-        br_estimator_noise(estimator, newest->time_s - before->time_s, noise);
+        br_estimator_noise(estimator, noise);
         memcpy(newest->x, now->x, sizeof newest->x);
         cycle->doubt = doubtful(cycle, now);
         if (!cycle->doubt || begins) cycle->monitor.trusted_s = newest->time_s;
@@ -433,8 +441,9 @@ static int begin_step(br_cycle *cycle, double u[BR_NU]) {
                           .at = *br_estimator_now(estimator)};
     double covariance[BR_NX * BR_NX];
     if (at_acting(cycle, u, &carried)) return -1;
-    for (int i = 0; i < BR_NX; ++i)
-        memcpy(covariance + BR_NX * i, carried.at.p[i], BR_NX * sizeof(double));
+    double p[BR_NA][BR_NA];
+    br_estimator_covariance(estimator, &carried.at, p);
+    for (int i = 0; i < BR_NX; ++i) memcpy(covariance + BR_NX * i, p[i], BR_NX * sizeof(double));
     return br_mpc_set_covariance(cycle->mpc, covariance) ? -1 : 0;
 }
 
@@ -554,8 +563,8 @@ br_mpc_error br_cycle_brake(const br_cycle *cycle, br_braking *braking) {
 /* A car is being driven: a step has been made, and no halt since. */
 void br_cycle_prepare(br_cycle *cycle, double period_s, double budget_s) {
     if (!cycle || !cycle->stepped) return;
+    if (cycle->stream.newest.estimated) foresee(cycle); /* by the last step's mismatch */
     cycle->controller.prepare(cycle->controller.self, period_s, budget_s);
-    if (cycle->stream.newest.estimated) foresee(cycle);
 }
 
 void br_cycle_rehearse(br_cycle *cycle) {

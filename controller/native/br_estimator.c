@@ -123,33 +123,55 @@ static void update(const br_measurement *m, double hp[BR_NX][BR_NA], double k[BR
         }
 }
 
-/* What the measurement says beyond what is believed; its squared distance by the covariance of
- * that. -1: refused, and nothing changes. */
-static double take(double gate, const br_measurement *m, br_estimate *b) {
-    const int n = m->count;
-    double hp[BR_NX][BR_NA], s[BR_NX][BR_NX], k[BR_NA][BR_NX];
-    double difference[BR_NX], weighted[BR_NX], squared = 0;
+/* Squared distance of what is new; -1: there is none. */
+static double distance(int n, double s[BR_NX][BR_NX], const double fresh[BR_NX]) {
+    double weighted[BR_NX], squared = 0;
+    if (!factorise(n, s)) return -1;
+    memcpy(weighted, fresh, sizeof weighted);
+    solve(n, s, weighted);
+    for (int a = 0; a < n; ++a) squared += fresh[a] * weighted[a];
+    return squared;
+}
+
+/* P H' S^-1 and the inverse of S, of its factor. */
+static void gains(int n, double s[BR_NX][BR_NX], double hp[BR_NX][BR_NA], double k[BR_NA][BR_NX],
+                  double inverse[BR_NX][BR_NX]) {
+    for (int i = 0; i < BR_NA; ++i) {
+        for (int a = 0; a < n; ++a) k[i][a] = hp[a][i];
+        solve(n, s, k[i]);
+    }
     for (int a = 0; a < n; ++a) {
-        difference[a] = m->value[a] - br_estimate_observed(b->x, m->of[a]);
-        if (m->of[a] == BR_INDEX_PSI) difference[a] = remainder(difference[a], 2 * M_PI);
-        weighted[a] = difference[a];
+        for (int c = 0; c < n; ++c) inverse[a][c] = a == c;
+        solve(n, s, inverse[a]);
+    }
+}
+
+/* What the measurement says beyond what is believed; its squared distance by the covariance of
+ * that. -1: refused, and nothing changes. shown: of the mismatch; NULL: not wanted. */
+static double take(const br_estimator *estimator, double gate, const br_measurement *m,
+                   br_estimate *b, br_mpc_noise *shown) {
+    const int n = m->count;
+    double hp[BR_NX][BR_NA], s[BR_NX][BR_NX], wide[BR_NX][BR_NX], k[BR_NA][BR_NX];
+    double fresh[BR_NX] = {0}, inverse[BR_NX][BR_NX];
+    for (int a = 0; a < n; ++a) {
+        fresh[a] = m->value[a] - br_estimate_observed(b->x, m->of[a]);
+        if (m->of[a] == BR_INDEX_PSI) fresh[a] = remainder(fresh[a], 2 * M_PI);
         for (int i = 0; i < BR_NA; ++i) hp[a][i] = br_estimate_observed(b->p[i], m->of[a]);
     }
     for (int a = 0; a < n; ++a) {
         for (int c = 0; c < n; ++c) s[a][c] = br_estimate_observed(hp[a], m->of[c]);
         s[a][a] += m->deviation[a] * m->deviation[a];
+        memcpy(wide[a], s[a], n * sizeof s[a][0]);
     }
-    if (!factorise(n, s)) return -1;
-    solve(n, s, weighted);
-    for (int a = 0; a < n; ++a) squared += difference[a] * weighted[a];
+    br_bias_widen(estimator, m, b, wide);
+    const double squared = distance(n, wide, fresh);
     if (!(squared >= 0) || (gate > 0 && squared > gate * EXCEEDED[n - 1])) return -1;
-    for (int i = 0; i < BR_NA; ++i) {
-        for (int a = 0; a < n; ++a) {
-            b->x[i] += hp[a][i] * weighted[a];
-            k[i][a] = hp[a][i];
-        }
-        solve(n, s, k[i]); /* P H' S^-1 */
-    }
+    if (!factorise(n, s)) return -1;
+    gains(n, s, hp, k, inverse);
+    if (shown) br_bias_learn(estimator, m, b, inverse, fresh, shown);
+    for (int i = 0; i < BR_NA; ++i)
+        for (int a = 0; a < n; ++a) b->x[i] += k[i][a] * fresh[a];
+    br_bias_take(m, k, b);
     update(m, hp, k, b);
     return squared;
 }
@@ -352,7 +374,7 @@ static double widen(const br_estimator *estimator, const br_event *one) {
     if (!br_instrument_near(instrument, m, &one->after)) return 1;
     if (br_estimator_blind(estimator, &contradicted) && contradicted) return 1;
     br_estimate alone = one->after;
-    return fmin(fmax(take(INFINITY, m, &alone) / m->count, 1), WIDEST);
+    return fmin(fmax(take(estimator, INFINITY, m, &alone, NULL) / m->count, 1), WIDEST);
 }
 
 /* The covariance, but for the offsets: these belong to the sensors. */
@@ -379,15 +401,19 @@ static void judge(br_estimator *estimator, br_event *one) {
     /* No model is off by so much in a gap, though its covariance may allow an outlier then. */
     const int possible =
         !estimator->agreed || !(gate > 0) || br_instrument_possible(&one->measured, &one->after);
-    double squared = possible ? take(gate, &one->measured, &with) : -1;
+    br_mpc_noise shown = estimator->observed;
+    double squared = possible ? take(estimator, gate, &one->measured, &with, &shown) : -1;
     if (first && squared < 0) one->widening = widen(estimator, one);
     if (squared < 0 && one->widening > 1) {
         grow(one->widening, &one->after);
         with = one->after;
-        squared = take(gate, &one->measured, &with);
+        shown = estimator->observed;
+        squared = take(estimator, gate, &one->measured, &with, &shown);
     }
     if (first && !count(estimator, one, squared)) one->left_out = squared >= 0 || instrument->fault;
-    if (squared >= 0 && !one->left_out) one->after = with;
+    if (squared < 0 || one->left_out) return;
+    one->after = with;
+    if (first) estimator->observed = shown;
 }
 
 /* The events from the k-th to before the end are done over. */
@@ -435,7 +461,7 @@ static br_mpc_error period(br_estimator *estimator, const br_event *given,
                            const br_measurement *measurements, int count,
                            const br_measurement *begun_with) {
     const br_event *newest = br_estimator_event(estimator, estimator->count - 1);
-    const double duration = given->time_s - newest->time_s;
+    const double duration = estimator->period_s = given->time_s - newest->time_s;
     br_event end = *given;
     end.after = newest->after;
     br_estimate predicted = newest->after;
@@ -476,6 +502,7 @@ br_mpc_error br_estimator_advance(br_estimator *estimator, double time_s, const 
         return BR_ERROR_NOT_READY;
     }
     if (anew) begin(estimator, pose, NULL);
+    memset(&estimator->observed, 0, sizeof estimator->observed);
     br_event end = {.time_s = time_s};
     memcpy(end.u, u, sizeof end.u);
     if (residual) end.residual = *residual;
@@ -499,9 +526,11 @@ br_mpc_error br_estimator_read(const br_estimator *estimator, br_belief *out) {
     const br_event *last = &estimator->events[estimator->order[estimator->count - 1]];
     out->time_s = last->time_s;
     memcpy(out->x, last->after.x, sizeof out->x);
+    double p[BR_NA][BR_NA];
+    br_estimator_covariance(estimator, &last->after, p);
     for (int i = 0; i < BR_NB; ++i)
-        memcpy(out->covariance + BR_NB * i, last->after.p[i], BR_NB * sizeof(double));
-    memcpy(out->corrected, estimator->corrected, sizeof out->corrected);
+        memcpy(out->covariance + BR_NB * i, p[i], BR_NB * sizeof(double));
+    br_estimator_noise(estimator, &out->noise);
     return BR_OK;
 }
 

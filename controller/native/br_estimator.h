@@ -17,6 +17,8 @@ _Static_assert(sizeof BR_RATE / sizeof BR_RATE[0] == BR_NE, "a state for each re
 typedef struct {
     double x[BR_NA], p[BR_NA][BR_NA];
     double way[BR_NX]; /* how far x has moved since the beginning of its period */
+    int biased;        /* x errs with the mismatch's weights, of which p has nothing: br_bias.c */
+    double by_weight[BR_NE][BR_NPHI][BR_NA];
 } br_estimate;
 
 typedef struct {
@@ -36,12 +38,17 @@ struct br_estimator {
     int count;               /* of events, the oldest first; 0: it has not begun */
     int order[BR_EVENTS];
     br_event events[BR_EVENTS];
-    double corrected[BR_NX]; /* see br_belief */
+    double period_s;         /* how long the newest period was; ... */
+    double corrected[BR_NX]; /* ... variances by which its measurements corrected what was
+                              * predicted from the one before */
     br_instrument instrument[BR_INSTRUMENTS];
     int agreed, astray;  /* since it began a pose has been used; so many were refused before */
     double posed_s;      /* of the newest pose that has been used; */
     br_measurement pose; /* the newest, used or not */
     int latched;         /* no instrument is believed again */
+    double weight[BR_NE][BR_NPHI], factor[BR_NE][BR_NPHI][BR_NPHI]; /* as in br_mpc_mismatch */
+    int uncertain[BR_NE];                                           /* there is such a factor */
+    br_mpc_noise observed; /* of the mismatch, in the newest period */
 };
 
 /* The k-th of its events. */
@@ -61,7 +68,35 @@ double br_estimate_observed(const double x[BR_NA], int state);
 
 br_mpc_error br_estimator_reach(const br_estimator *estimator, const double u[BR_NU],
                                 const br_residual *residual, double duration, br_estimate *b);
-void br_estimator_noise(br_estimator *estimator, double duration_s, br_mpc_noise *noise);
+void br_estimator_noise(const br_estimator *estimator, br_mpc_noise *noise);
+
+/* --- br_bias.c: how an estimate errs with the mismatch's weights --- */
+
+/* Over a period: f, with accelerations, and by_acceleration are its derivatives, phi the terms of
+ * its mismatch, all 0 where that is not estimated. The i-th state has faded. */
+void br_bias_move(const double f[BR_NX][BR_NA], const double by_acceleration[BR_NX * BR_NE],
+                  const double phi[BR_NPHI], br_estimate *b);
+void br_bias_fade(int i, double left, br_estimate *b);
+
+/* With a measurement, which is taken by this gain. */
+void br_bias_take(const br_measurement *m, double gain[BR_NA][BR_NX], br_estimate *b);
+
+/* Adds to the covariance of what is new in a measurement what the weights' adds to it. */
+void br_bias_widen(const br_estimator *estimator, const br_measurement *m, const br_estimate *b,
+                   double s[BR_NX][BR_NX]);
+
+/* Adds what a measurement shows of the weights: by what is new in it, and the inverse of its
+ * covariance where they are known. */
+void br_bias_learn(const br_estimator *estimator, const br_measurement *m, const br_estimate *b,
+                   const double inverse[BR_NX][BR_NX], const double fresh[BR_NX],
+                   br_mpc_noise *shown);
+
+/* w' phi of an output. */
+double br_bias_mean(const br_estimator *estimator, int output, const double phi[BR_NPHI]);
+
+/* The covariance of an estimate, all included. */
+void br_estimator_covariance(const br_estimator *estimator, const br_estimate *b,
+                             double p[BR_NA][BR_NA]);
 
 /* --- br_instrument.c: whether what an instrument reports can be believed --- */
 

@@ -40,8 +40,6 @@ typedef struct {
     double uu[2 * BR_NU][2 * BR_NU];                         /* of [u; u_before] */
 } br_stage_curvature;
 
-enum { BR_NPHI = 1 + BR_NZ + BR_NE }; /* terms of the mismatch: see br_mismatch.c */
-
 /* Linearisation of the corrected model at one stage. */
 typedef struct {
     double f[BR_NX];
@@ -127,6 +125,7 @@ typedef struct {
 typedef struct {
     double duration; /* 0: there is none */
     double x[BR_NX], u[BR_NU], x_next[BR_NX];
+    int estimated; /* the states are estimates, with noise; else they are exact */
     br_mpc_noise noise;
 } br_transition;
 
@@ -223,6 +222,7 @@ typedef struct {
     __typeof__(br_mpc_steer) *steer;
 #endif
     __typeof__(br_mpc_variance) *variance;
+    __typeof__(br_mpc_get_mismatch) *mismatch;
     __typeof__(br_mpc_evaluate) *evaluate;
     br_mpc_error (*load)(br_gp *gp, const br_mpc_gp outputs[BR_NE]);
 #if BR_HAS_PATH
@@ -380,6 +380,7 @@ BR_PART void br_stage_linearise(const br_gp *gp, const double x[BR_NX], const do
 BR_PART __typeof__(br_mpc_predict) br_predict;
 BR_PART __typeof__(br_mpc_propagate) br_propagate;
 BR_PART __typeof__(br_mpc_variance) br_variance;
+BR_PART __typeof__(br_mpc_get_mismatch) br_get_mismatch;
 BR_PART __typeof__(br_mpc_evaluate) br_evaluate;
 /* br_predict by these weights; gp NULL: without correction. */
 BR_PART br_mpc_error br_predict_by(const br_mpc *mpc, const br_gp *gp, const double x[BR_NX],
@@ -424,11 +425,14 @@ BR_PART int br_mismatch_due(const br_mismatch *mismatch);
 BR_PART void br_mismatch_undo(br_mismatch *mismatch);
 /* What is due, by the variance of the residual there; the plan is linearised. */
 BR_PART void br_mismatch_judge(br_mpc *mpc, const double variance[BR_NE]);
-/* Variance of what is not known of the mismatch at a stage of the plan. */
-BR_PART double br_mismatch_variance(const br_mpc *mpc, int stage, int output);
-/* w' phi of each output at x and u, which lead to `end` by the corrected model. */
-BR_PART void br_mismatch_mean(const br_mpc *mpc, const double x[BR_NX], const double u[BR_NU],
-                              const double end[BR_NX], double duration, double error[BR_NE]);
+/* phi of a transition from x under u to `end`, by the corrected model, in so many stages. */
+BR_PART void br_mismatch_terms(const double x[BR_NX], const double u[BR_NU],
+                               const double end[BR_NX], double stages, double phi[BR_NPHI]);
+/* w' phi of each output; the variance of what is not known of it, of one. */
+BR_PART void br_mismatch_mean(const br_mpc *mpc, const double phi[BR_NPHI], double error[BR_NE]);
+BR_PART double br_mismatch_variance(const br_mpc *mpc, const double phi[BR_NPHI], int output);
+/* The part of it that no weights explain. */
+BR_PART double br_mismatch_unexplained(const br_mpc *mpc, const double phi[BR_NPHI], int output);
 /* To a stage that is linearised without it, to first order in it. */
 BR_PART void br_mismatch_add(const br_mpc *mpc, const double x[BR_NX], const double u[BR_NU],
                              br_stage *stage);

@@ -39,7 +39,9 @@
 #define RECENT 10.0       /* stages over whose mean square errors are surprising, if it is ... */
 #define SURPRISING 2.0    /* ... above this */
 #define LARGEST 20.0      /* errors over what is usual: no single wrong measurement counts more */
+#define TELLING 0.1       /* of the residual's deviation: what errors have to be known to */
 #define EXPLAINED 1.5     /* mean square of errors over r up to which noise explains them */
+#define CHANCE 2.0        /* standard deviations by which a mean square may exceed that */
 
 static double feature_size(int a) {
     return BR_FEATURE[a] < BR_NX ? BR_STATE_DEVIATION[BR_FEATURE[a]]
@@ -48,9 +50,8 @@ static double feature_size(int a) {
 
 static double change_size(int state) { return ACCELERATION * BR_STATE_DEVIATION[state]; }
 
-/* phi, of a transition to `end` by the corrected model. */
-static void phi_of(const double x[BR_NX], const double u[BR_NU], const double end[BR_NX],
-                   double stages, double phi[BR_NPHI]) {
+void br_mismatch_terms(const double x[BR_NX], const double u[BR_NU], const double end[BR_NX],
+                       double stages, double phi[BR_NPHI]) {
     double z[BR_NZ];
     br_stage_features(x, u, z);
     phi[0] = 1;
@@ -174,41 +175,72 @@ static void maximise_evidence(int output, br_regression *of) {
     of->prior = same >= fmax(less, more) ? middle : less > more ? middle / 4 : middle * 4;
     if (of->prior != middle) regress(output, of->prior, of);
     of->noise_scale = mean_square_left(of);
-    of->unexplained = r * fmax(of->noise_scale - EXPLAINED, 0);
+    const double chance = CHANCE * sqrt(2 / of->count); /* chi-squared */
+    of->unexplained = r * fmax(of->noise_scale - EXPLAINED - chance, 0);
 }
 
-void br_mismatch_judge(br_mpc *mpc, const double variance[BR_NE]) {
+/* An error y of an output at phi, of variance r. */
+static void learn(br_mismatch *m, int output, const double phi[BR_NPHI], double y, double r,
+                  double stages) {
+    br_regression *of = &m->of[output];
+    if (!(r > 0 && isfinite(r))) return;
+    const double expected = dot(m->weight[output], phi), usual = fmax(of->noise_scale, 1) * r;
+    const double error = clipped(y - expected, usual);
+    remember(of, phi, expected + error, r, kept_share(of, error, usual, stages));
+    maximise_evidence(output, of);
+}
+
+/* What exact states show. */
+static void learn_exact(br_mpc *mpc, const double variance[BR_NE]) {
     br_mismatch *m = &mpc->mismatch;
     const br_gp *gp = &mpc->gp[mpc->gp_in_use];
     const br_transition *due = &m->due;
     const double stages = due->duration / BR_TS;
     double end[BR_NX], phi[BR_NPHI];
     if (br_predict_by(mpc, gp, due->x, due->u, due->duration, end)) return;
-    memcpy(m->before, m->of, sizeof m->before);
-    m->judged = 1;
-    phi_of(due->x, due->u, end, stages, phi);
+    br_mismatch_terms(due->x, due->u, end, stages, phi);
     for (int j = 0; j < BR_NE; ++j) {
-        br_regression *of = &m->of[j];
         const int i = BR_CHANGED[j];
         const double share = mpc->stage[0].in_e[i][j] * stages, noise = gp->variance[j].noise;
         if (share == 0) continue; /* nothing is known of this output */
-        const double measured = due->noise.corrected[i] / (share * share);
-        const double r = CORRELATED * fmax(variance[j] - noise, 0) + noise + measured;
-        if (!(r > 0 && isfinite(r))) continue;
-        const double expected = dot(m->weight[j], phi), usual = fmax(of->noise_scale, 1) * r;
-        const double error = clipped((due->x_next[i] - end[i]) / share - expected, usual);
-        remember(of, phi, expected + error, r, kept_share(of, error, usual, stages));
-        maximise_evidence(j, of);
+        const double r = CORRELATED * fmax(variance[j] - noise, 0) + noise;
+        learn(m, j, phi, (due->x_next[i] - end[i]) / share, r, stages);
     }
+}
+
+/* What measurements show. One that says next to nothing would hide what others say, by its part in
+ * the usual r. */
+static void learn_estimated(br_mpc *mpc) {
+    br_mismatch *m = &mpc->mismatch;
+    const br_gp *gp = &mpc->gp[mpc->gp_in_use];
+    const br_transition *due = &m->due;
+    for (int j = 0; j < BR_NE; ++j) {
+        const double r = 1 / due->noise.information[j];
+        double phi[BR_NPHI];
+        if (!(r < TELLING * TELLING * gp->variance[j].signal)) continue;
+        for (int a = 0; a < BR_NPHI; ++a) phi[a] = r * due->noise.phi[j][a];
+        learn(m, j, phi, r * due->noise.error[j], r, due->duration / BR_TS);
+    }
+}
+
+void br_mismatch_judge(br_mpc *mpc, const double variance[BR_NE]) {
+    br_mismatch *m = &mpc->mismatch;
+    memcpy(m->before, m->of, sizeof m->before);
+    m->judged = 1;
+    if (m->due.estimated)
+        learn_estimated(mpc);
+    else
+        learn_exact(mpc, variance);
 }
 
 /* --- in the plan --- */
 
-double br_mismatch_variance(const br_mpc *mpc, int stage, int output) {
-    const br_regression *of = &mpc->mismatch.of[output];
-    if (!(of->count > 0)) return 0;
-    const double *phi = mpc->stage[stage].phi;
-    const double mean = dot(of->weight, phi);
+void br_mismatch_mean(const br_mpc *mpc, const double phi[BR_NPHI], double error[BR_NE]) {
+    for (int j = 0; j < BR_NE; ++j) error[j] = dot(mpc->mismatch.weight[j], phi);
+}
+
+/* phi' P phi */
+static double of_weights(const br_regression *of, const double phi[BR_NPHI]) {
     double solved[BR_NPHI], sum = 0;
     for (int a = 0; a < BR_NPHI; ++a) {
         solved[a] = phi[a];
@@ -216,20 +248,21 @@ double br_mismatch_variance(const br_mpc *mpc, int stage, int output) {
         solved[a] *= of->factor[a][a];
         sum += solved[a] * solved[a];
     }
-    const double leverage = sum * of->precision / (of->scaled_by * BR_NPHI);
-    return sum + of->unexplained + NONLINEAR * NONLINEAR * leverage * mean * mean;
+    return sum;
 }
 
-/* w' phi of each output. */
-static void error_of(const br_mpc *mpc, const double phi[BR_NPHI], double error[BR_NE]) {
-    for (int j = 0; j < BR_NE; ++j) error[j] = dot(mpc->mismatch.weight[j], phi);
+double br_mismatch_unexplained(const br_mpc *mpc, const double phi[BR_NPHI], int output) {
+    const br_regression *of = &mpc->mismatch.of[output];
+    if (!(of->count > 0)) return 0;
+    const double mean = dot(of->weight, phi);
+    const double leverage = of_weights(of, phi) * of->precision / (of->scaled_by * BR_NPHI);
+    return of->unexplained + NONLINEAR * NONLINEAR * leverage * mean * mean;
 }
 
-void br_mismatch_mean(const br_mpc *mpc, const double x[BR_NX], const double u[BR_NU],
-                      const double end[BR_NX], double duration, double error[BR_NE]) {
-    double phi[BR_NPHI];
-    phi_of(x, u, end, duration / BR_TS, phi);
-    error_of(mpc, phi, error);
+double br_mismatch_variance(const br_mpc *mpc, const double phi[BR_NPHI], int output) {
+    const br_regression *of = &mpc->mismatch.of[output];
+    if (!(of->count > 0)) return 0;
+    return of_weights(of, phi) + br_mismatch_unexplained(mpc, phi, output);
 }
 
 void br_mismatch_add(const br_mpc *mpc, const double x[BR_NX], const double u[BR_NU],
@@ -237,9 +270,9 @@ void br_mismatch_add(const br_mpc *mpc, const double x[BR_NX], const double u[BR
     double error[BR_NE], slope[BR_NE][BR_NV] = {{0}};
     memcpy(stage->plain_f, stage->f, sizeof stage->f);
     memcpy(stage->plain_jacobian, stage->jacobian, sizeof stage->jacobian);
-    phi_of(x, u, stage->f, 1, stage->phi);
+    br_mismatch_terms(x, u, stage->f, 1, stage->phi);
     if (!mpc->mismatch.any) return;
-    error_of(mpc, stage->phi, error);
+    br_mismatch_mean(mpc, stage->phi, error);
     for (int j = 0; j < BR_NE; ++j) {
         const double *w = mpc->mismatch.weight[j];
         for (int a = 0; a < BR_NZ; ++a) slope[j][BR_FEATURE[a]] += w[1 + a] / feature_size(a);

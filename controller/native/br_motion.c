@@ -13,7 +13,7 @@
 /* P <- F P F' + Q, where what is beside the states stays. */
 static void spread(const double jacobian[BR_NX * BR_NX],
                    const double by_acceleration[BR_NX * BR_NE], const double q[BR_NX * BR_NX],
-                   br_estimate *b) {
+                   const double phi[BR_NPHI], br_estimate *b) {
     double f[BR_NX][BR_NA] = {{0}}, fp[BR_NX][BR_NA];
     for (int i = 0; i < BR_NX; ++i) {
         for (int l = 0; l < BR_NX; ++l) f[i][l] = jacobian[BR_NX * i + l];
@@ -33,6 +33,7 @@ static void spread(const double jacobian[BR_NX * BR_NX],
         }
         for (int j = BR_NX; j < BR_NA; ++j) b->p[i][j] = b->p[j][i] = fp[i][j];
     }
+    br_bias_move(f, by_acceleration, phi, b);
 }
 
 /* The yaw acceleration of a car that follows its steering angle, with a lag, as a car that
@@ -78,6 +79,12 @@ static br_mpc_error walk(const br_estimator *estimator, const br_estimate *b, co
     return BR_OK;
 }
 
+/* The largest acceleration of any car's: no model errs by more. */
+static double largest(int j) {
+    return BR_RATE[j] == BR_INDEX_OMEGA ? BR_MONITOR_YAW_ACCELERATION_RADPS2
+                                        : BR_MONITOR_ACCELERATION_MPS2;
+}
+
 /* What of the residual's variance is no noise, but a guess: where a Gaussian process has not been
  * trained, its error follows the car's state, and lasts for longer than a stage. */
 static double guessed(const br_residual *residual, int j) {
@@ -87,7 +94,8 @@ static double guessed(const br_residual *residual, int j) {
 /* The variance of an acceleration: in place of the model, or of what this errs by. */
 static double walking(const br_estimation *s, const br_residual *residual, int j) {
     const double deviation = s->acceleration[j], erring = GUESSING / BR_TS;
-    return deviation * deviation + erring * erring * guessed(residual, j);
+    return deviation * deviation +
+           fmin(erring * erring * guessed(residual, j), largest(j) * largest(j));
 }
 
 /* Accelerations after a duration: less of what they were, and something new. */
@@ -99,6 +107,7 @@ static void fade(const br_estimation *s, const br_residual *residual, double dur
         b->x[i] *= left;
         for (int l = 0; l < BR_NA; ++l) b->p[i][l] = b->p[l][i] = left * b->p[i][l];
         b->p[i][i] = left * b->p[i][i] + (1 - left * left) * walking(s, residual, j);
+        br_bias_fade(i, left, b);
     }
 }
 
@@ -107,19 +116,24 @@ static void fade(const br_estimation *s, const br_residual *residual, double dur
 static br_mpc_error propagate(const br_estimator *estimator, const double u[BR_NU],
                               const br_residual *residual, double duration, br_estimate *b) {
     double f[BR_NX * BR_NX], by[BR_NX * BR_NE], q[BR_NX * BR_NX], begin[BR_NX], next[BR_NX];
-    double white[BR_NE];
+    double white[BR_NE], beside[BR_NE];
     for (int i = 0; i < BR_NX; ++i) begin[i] = b->x[i] - b->way[i];
-    for (int j = 0; j < BR_NE; ++j) white[j] = residual->variance[j] - guessed(residual, j);
+    for (int j = 0; j < BR_NE; ++j) {
+        white[j] = residual->variance[j] - guessed(residual, j);
+        const double most = largest(j);
+        const double mismatch = br_bias_mean(estimator, j, residual->phi) / BR_TS;
+        beside[j] = fmin(fmax(mismatch, -most), most) + b->x[BR_NB + j];
+    }
     const br_mpc_error error = estimator->walks
                                    ? walk(estimator, b, u, duration, next, f, by, q)
                                    : br_mpc_propagate(estimator->mpc, b->x, begin, u, duration,
-                                                      white, b->x + BR_NB, next, f, by, q);
+                                                      white, beside, next, f, by, q);
     if (error) return error;
     for (int i = 0; i < BR_NX; ++i) {
         b->way[i] += next[i] - b->x[i];
         b->x[i] = next[i];
     }
-    spread(f, by, q, b);
+    spread(f, by, q, residual->phi, b);
     const br_estimation *s = &estimator->settings;
     for (int i = 0; i < BR_NB; ++i)
         if (i < BR_NX || s->start[i] > 0) b->p[i][i] += duration * s->drift[i] * s->drift[i];
@@ -147,9 +161,10 @@ br_mpc_error br_estimator_reach(const br_estimator *estimator, const double u[BR
  * each state taken by itself. Where measurements say little that is more than is corrected: what
  * they have not shown of the car's step is no error of whatever weights. c is q for what is
  * independent from one step to the next, and more for accelerations that last. */
-void br_estimator_noise(br_estimator *estimator, double duration_s, br_mpc_noise *noise) {
+void br_estimator_noise(const br_estimator *estimator, br_mpc_noise *noise) {
+    const double duration_s = estimator->period_s;
     const br_estimation *s = &estimator->settings;
-    const br_event *newest = br_estimator_event(estimator, estimator->count - 1);
+    const br_event *newest = &estimator->events[estimator->order[estimator->count - 1]];
     const br_estimate *now = &newest->after;
     double q[BR_NX], c[BR_NX];
     for (int i = 0; i < BR_NX; ++i) c[i] = q[i] = duration_s * s->drift[i] * s->drift[i];
@@ -161,10 +176,10 @@ void br_estimator_noise(br_estimator *estimator, double duration_s, br_mpc_noise
         q[i] += duration_s * duration_s * now->p[acceleration][acceleration];
         c[i] += duration_s * now->p[acceleration][i] / left; /* as it was predicted */
     }
+    *noise = estimator->observed;
     for (int i = 0; i < BR_NX; ++i) {
         const double corrected = estimator->corrected[i], predicted = now->p[i][i] + corrected;
         const double shown = predicted > 0 ? corrected / predicted : 0;
-        noise->corrected[i] = corrected;
         noise->step[i] = fmax(corrected + q[i] - 2 * c[i] * shown, 0);
     }
 }

@@ -151,14 +151,15 @@ static void nominal_over(const double x[BR_NX], const double u[BR_NU], const dou
  */
 static void stage_advance(const br_gp *gp, const br_mpc *mismatched, const double x[BR_NX],
                           const double u[BR_NU], double duration, double x_next[BR_NX]) {
-    double z[BR_NZ], mean[BR_NE] = {0}, error[BR_NE];
+    double z[BR_NZ], mean[BR_NE] = {0}, error[BR_NE], phi[BR_NPHI];
     const double share = duration / BR_TS;
     br_stage_features(x, u, z);
     if (gp && gp->any) br_gp_mean(gp, z, mean);
     for (int j = 0; j < BR_NE; ++j) mean[j] *= share;
     nominal_over(x, u, mean, duration, x_next);
     if (!mismatched) return;
-    br_mismatch_mean(mismatched, x, u, x_next, duration, error);
+    br_mismatch_terms(x, u, x_next, share, phi);
+    br_mismatch_mean(mismatched, phi, error);
     for (int j = 0; j < BR_NE; ++j) mean[j] += share * error[j];
     nominal_over(x, u, mean, duration, x_next);
 }
@@ -296,6 +297,25 @@ br_mpc_error br_variance(br_mpc *mpc, const double v[BR_NV], double variance[BR_
     br_stages_variances(gp, 1, x, u, mpc->caution.correlations, found);
     memcpy(variance, found, sizeof found);
     for (int j = 0; noise && j < BR_NE; ++j) noise[j] = gp->variance[j].noise;
+    return BR_OK;
+}
+
+br_mpc_error br_get_mismatch(const br_mpc *mpc, const double v[BR_NV], br_mpc_mismatch *mismatch) {
+    if (!v || !mismatch) return BR_ERROR_NULL;
+    const br_gp *gp = &mpc->gp[mpc->gp_in_use];
+    double end[BR_NX];
+    memset(mismatch, 0, sizeof *mismatch);
+    if (!mpc->caution.active || gp != believed(mpc)) return BR_OK;
+    const br_mpc_error error = br_predict_by(mpc, gp, v, v + BR_NX, BR_TS, end);
+    if (error) return error;
+    br_mismatch_terms(v, v + BR_NX, end, 1, mismatch->phi);
+    memcpy(mismatch->weight, mpc->mismatch.weight, sizeof mismatch->weight);
+    for (int j = 0; j < BR_NE; ++j) {
+        const br_regression *of = &mpc->mismatch.of[j];
+        if (!(of->count > 0)) continue;
+        memcpy(mismatch->factor[j], of->factor, sizeof of->factor);
+        mismatch->unexplained[j] = br_mismatch_unexplained(mpc, mismatch->phi, j);
+    }
     return BR_OK;
 }
 

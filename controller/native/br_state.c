@@ -319,6 +319,15 @@ const char *br_cycle_fault_text(br_fault fault) {
 #define LEAST_STAGES 0.5 /* of a transition by which the model is judged; ... */
 #define MOST_STAGES 2    /* ... and at most */
 
+static void add(const br_mpc_noise *noise, br_mpc_noise *sum) {
+    for (int i = 0; i < BR_NX; ++i) sum->step[i] += noise->step[i];
+    for (int j = 0; j < BR_NE; ++j) {
+        sum->information[j] += noise->information[j];
+        sum->error[j] += noise->error[j];
+        for (int k = 0; k < BR_NPHI; ++k) sum->phi[j][k] += noise->phi[j][k];
+    }
+}
+
 /* Shows the compiled controller what the car does from stage to stage: states that come more often
  * are taken together, and where one is lost, or the mean input is not known, it begins anew. A
  * standing car shows nothing. */
@@ -334,22 +343,19 @@ void br_shown_observe(br_shown *shown, br_mpc *mpc, const br_driving *settings,
     if (shown->duration_s == 0) {
         memcpy(shown->x, before->x, sizeof shown->x);
         memset(shown->u, 0, sizeof shown->u);
-        shown->noise = (br_mpc_noise){{0}, {0}};
+        memset(&shown->noise, 0, sizeof shown->noise);
     }
     const double duration_s = shown->duration_s + step_s;
     for (int i = 0; i < BR_NU; ++i)
         shown->u[i] += (state->u_applied[i] - shown->u[i]) * step_s / duration_s;
-    for (int i = 0; noise && i < BR_NX; ++i) {
-        shown->noise.corrected[i] += noise->corrected[i];
-        shown->noise.step[i] += noise->step[i];
-    }
+    if (noise) add(noise, &shown->noise);
     shown->duration_s = duration_s;
     if (duration_s < LEAST_STAGES * BR_TS) return;
     shown->duration_s = 0;
     if (duration_s <= MOST_STAGES * BR_TS && fabs(shown->x[BR_INDEX_VX]) > settings->standing_mps) {
         const int stage = fabs(duration_s - BR_TS) < STAGE_ROUNDING * BR_TS;
         br_mpc_observe(mpc, shown->x, shown->u, stage ? BR_TS : duration_s, state->x,
-                       &shown->noise);
+                       noise ? &shown->noise : NULL);
     }
 }
 

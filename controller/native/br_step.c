@@ -452,6 +452,7 @@ const br_code BR_CODE = {.step = br_step,
                          .steer = br_steer,
 #endif
                          .variance = br_variance,
+                         .mismatch = br_get_mismatch,
                          .evaluate = br_evaluate,
 #if BR_HAS_PATH
                          .limit = br_limit_speeds,

@@ -60,7 +60,7 @@ def adopt(step: NativeStep, new: GpWeights) -> None:
 def show(
     step: NativeStep, drive: Drive, first: int = 0, last: int = 600, noise: Floats | None = None
 ) -> Iterator[int]:
-    """The drive to the controller, sample by sample; ``noise`` (n, 2, 7): of each."""
+    """The drive to the controller, sample by sample; ``noise`` (n, 7): of each."""
     x, u = drive
     for k in range(first, last):
         step.observe(x[k], u[k], STEP_S, x[k + 1], None if noise is None else noise[k])
@@ -112,18 +112,18 @@ def test_what_noise_explains_is_no_error(
     step: NativeStep, drive: Drive, honest: GpWeights, again: GpWeights, car: CarParameters
 ) -> None:
     """Against the formula: each square less the noise, by 1 / (1 + noise / resolution^2)."""
-    noise = np.random.default_rng(2).uniform(0, 4e-5, (90, 2, 7))
+    noise = np.random.default_rng(2).uniform(0, 4e-5, (90, 7))
     step.set_weights(again)
     adopt(step, honest)
     list(show(step, drive, last=90, noise=noise))
     _, residuals, stated = step.samples()
-    np.testing.assert_allclose(stated, noise[:, 1, 3:6], rtol=1e-9)
+    np.testing.assert_allclose(stated, noise[:, 3:6], rtol=1e-9)
     found = step.watch(RESOLUTION)
     weight = 1 / (1 + stated / RESOLUTION**2)
     beyond = (weight * (residuals**2 - stated)).sum(axis=0) / weight.sum(axis=0)
     assert list(found.nominal) == pytest.approx(np.sqrt(beyond).tolist(), rel=1e-9)
-    noise[:, 1] = 1.0  # more than all errors
-    list(show(step, drive, 90, 90 + WATCHED, np.tile(noise, (3, 1, 1))))
+    noise[:] = 1.0  # more than all errors
+    list(show(step, drive, 90, 90 + WATCHED, np.tile(noise, (3, 1))))
     found = step.watch(RESOLUTION)
     assert [*found.in_use, *found.proven, *found.nominal] == [0.0] * 9
 

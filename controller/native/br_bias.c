@@ -1,0 +1,153 @@
+/* How an estimate errs with what its model errs by.
+ *
+ * The residual errs by w' phi, the mismatch (br_mismatch.c), whose weights w are estimated beside
+ * the state, from what is new in the measurements (Friedland, "Treatment of bias in recursive
+ * filtering", IEEE Trans. AC 14, 1969). The filter goes on as if they were known. Beside it, for
+ * each weight, goes by how much the estimate errs if that is larger by one, a column of U:
+ *
+ *   U <- F U + G phi'           over a period, with G from an output's residual to the state,
+ *   U <- U - K H U              with a measurement,
+ *
+ * and what is new in a measurement is H U (w - w_used), and white noise of covariance S. That is
+ * what the regression learns from. Its weights, once others, move what was estimated by U times the
+ * change, and their covariance M makes that of the estimate P + U M U'. All of it is exact for a
+ * linear model and weights that stay the same.
+ */
+#include "br_estimator.h"
+
+#include <string.h>
+
+#if BR_HAS_PATH
+
+void br_bias_move(const double f[BR_NX][BR_NA], const double by_acceleration[BR_NX * BR_NE],
+                  const double phi[BR_NPHI], br_estimate *b) {
+    if (phi[0] != 0 && !b->biased) {
+        memset(b->by_weight, 0, sizeof b->by_weight);
+        b->biased = 1;
+    }
+    for (int j = 0; b->biased && j < BR_NE; ++j)
+        for (int k = 0; k < BR_NPHI; ++k) {
+            double *by = b->by_weight[j][k], after[BR_NX];
+            for (int i = 0; i < BR_NX; ++i) {
+                after[i] = by_acceleration[BR_NE * i + j] * phi[k] / BR_TS;
+                for (int l = 0; l < BR_NX; ++l) after[i] += f[i][l] * by[l];
+                for (int l = BR_NB; l < BR_NA; ++l) after[i] += f[i][l] * by[l];
+            }
+            memcpy(by, after, sizeof after);
+        }
+}
+
+void br_bias_fade(int i, double left, br_estimate *b) {
+    for (int j = 0; b->biased && j < BR_NE; ++j)
+        for (int k = 0; k < BR_NPHI; ++k) b->by_weight[j][k][i] *= left;
+}
+
+/* H U of an output. */
+static void observed(const br_estimate *b, const br_measurement *m, int output,
+                     double by[BR_NX][BR_NPHI]) {
+    for (int a = 0; a < m->count; ++a)
+        for (int k = 0; k < BR_NPHI; ++k)
+            by[a][k] = br_estimate_observed(b->by_weight[output][k], m->of[a]);
+}
+
+void br_bias_take(const br_measurement *m, double gain[BR_NA][BR_NX], br_estimate *b) {
+    for (int j = 0; b->biased && j < BR_NE; ++j) {
+        double by[BR_NX][BR_NPHI];
+        observed(b, m, j, by);
+        for (int k = 0; k < BR_NPHI; ++k)
+            for (int i = 0; i < BR_NA; ++i)
+                for (int a = 0; a < m->count; ++a) b->by_weight[j][k][i] -= gain[i][a] * by[a][k];
+    }
+}
+
+/* L^-1 v */
+static void whiten(const br_estimator *estimator, int output, const double v[BR_NPHI],
+                   double white[BR_NPHI]) {
+    for (int k = 0; k < BR_NPHI; ++k) {
+        const double *row = estimator->factor[output][k];
+        white[k] = v[k];
+        for (int l = 0; l < k; ++l) white[k] -= row[l] * white[l];
+        white[k] *= row[k];
+    }
+}
+
+void br_bias_widen(const br_estimator *estimator, const br_measurement *m, const br_estimate *b,
+                   double s[BR_NX][BR_NX]) {
+    for (int j = 0; b->biased && j < BR_NE; ++j) {
+        double by[BR_NX][BR_NPHI], white[BR_NX][BR_NPHI];
+        if (!estimator->uncertain[j]) continue;
+        observed(b, m, j, by);
+        for (int a = 0; a < m->count; ++a) whiten(estimator, j, by[a], white[a]);
+        for (int a = 0; a < m->count; ++a)
+            for (int c = 0; c < m->count; ++c)
+                for (int k = 0; k < BR_NPHI; ++k) s[a][c] += white[a][k] * white[c][k];
+    }
+}
+
+void br_estimator_covariance(const br_estimator *estimator, const br_estimate *b,
+                             double p[BR_NA][BR_NA]) {
+    memcpy(p, b->p, sizeof b->p);
+    for (int j = 0; b->biased && j < BR_NE; ++j) {
+        double by[BR_NPHI], white[BR_NA][BR_NPHI];
+        if (!estimator->uncertain[j]) continue;
+        for (int i = 0; i < BR_NA; ++i) {
+            for (int k = 0; k < BR_NPHI; ++k) by[k] = b->by_weight[j][k][i];
+            whiten(estimator, j, by, white[i]);
+        }
+        for (int i = 0; i < BR_NA; ++i)
+            for (int l = 0; l < BR_NA; ++l)
+                for (int k = 0; k < BR_NPHI; ++k) p[i][l] += white[i][k] * white[l][k];
+    }
+}
+
+/* One number for each output, because these are learned one by one: what is new, along the
+ * direction in which an error of the output shows that is the same everywhere. */
+void br_bias_learn(const br_estimator *estimator, const br_measurement *m, const br_estimate *b,
+                   const double inverse[BR_NX][BR_NX], const double fresh[BR_NX],
+                   br_mpc_noise *shown) {
+    for (int j = 0; b->biased && j < BR_NE; ++j) {
+        double by[BR_NX][BR_NPHI];
+        observed(b, m, j, by);
+        for (int a = 0; a < m->count; ++a) {
+            double along = 0, expected = 0;
+            for (int c = 0; c < m->count; ++c) along += inverse[a][c] * by[c][0];
+            for (int k = 0; k < BR_NPHI; ++k) {
+                expected += by[a][k] * estimator->weight[j][k];
+                shown->phi[j][k] += along * by[a][k];
+            }
+            shown->information[j] += along * by[a][0];
+            shown->error[j] += along * (fresh[a] + expected);
+        }
+    }
+}
+
+double br_bias_mean(const br_estimator *estimator, int output, const double phi[BR_NPHI]) {
+    double sum = 0;
+    for (int k = 0; k < BR_NPHI; ++k) sum += estimator->weight[output][k] * phi[k];
+    return sum;
+}
+
+static void shift(const br_estimator *estimator, const br_mpc_mismatch *mismatch, br_estimate *b) {
+    for (int j = 0; j < BR_NE; ++j)
+        for (int k = 0; k < BR_NPHI; ++k) {
+            const double more = mismatch->weight[j][k] - estimator->weight[j][k];
+            if (more == 0) continue;
+            for (int i = 0; i < BR_NA; ++i) b->x[i] += more * b->by_weight[j][k][i];
+        }
+}
+
+br_mpc_error br_estimator_correct(br_estimator *estimator, const br_mpc_mismatch *mismatch) {
+    if (!estimator || !mismatch) return BR_ERROR_NULL;
+    const int estimated = mismatch->phi[0] != 0;
+    for (int e = 0; e < estimator->count; ++e) {
+        br_estimate *b = &br_estimator_event(estimator, e)->after;
+        if (b->biased && estimated) shift(estimator, mismatch, b);
+        b->biased &= estimated;
+    }
+    memcpy(estimator->weight, mismatch->weight, sizeof estimator->weight);
+    memcpy(estimator->factor, mismatch->factor, sizeof estimator->factor);
+    for (int j = 0; j < BR_NE; ++j) estimator->uncertain[j] = mismatch->factor[j][0][0] > 0;
+    return BR_OK;
+}
+
+#endif
