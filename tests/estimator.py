@@ -68,14 +68,17 @@ class Estimator:
             given.factor = roots.tolist()
         self._check(self._library.br_estimator_correct(self.handle, given), "mismatch")
 
-    def shown(self) -> tuple[Floats, Floats, Floats]:
-        """What the last period has shown of the mismatch: information (ne,), error (ne,) and terms
-        (ne, nphi), the latter two weighted with it."""
+    def shown(self) -> tuple[Floats, Floats, Floats, float]:
+        """What the last period has shown of the mismatch: information (ne, nphi, nphi), projection
+        (ne, nphi), squares (ne,), and of how many values."""
         self.read()
         noise = self._belief.noise
-        parts = (noise.information, noise.error, noise.phi)
-        information, error, phi = (np.frombuffer(self._ffi.buffer(one), float) for one in parts)
-        return information.copy(), error.copy(), phi.reshape(len(error), -1).copy()
+        information, projection, squares = (
+            np.frombuffer(self._ffi.buffer(one), float).copy()
+            for one in (noise.information, noise.projection, noise.squares)
+        )
+        rows = projection.reshape(len(squares), -1)
+        return information.reshape(*rows.shape, -1), rows, squares, noise.values
 
     def read(self) -> Belief:
         """At the end of the last period; InputError while nothing is known."""

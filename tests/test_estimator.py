@@ -343,10 +343,12 @@ def test_a_mismatch_is_what_a_filter_of_state_and_mismatch_finds(make: Make, dri
     information = error = 0.0
     for k, u in enumerate(drive.u):
         made.advance(TS * (k + 1), u, (VARIANCE, NOISE, TERMS), drive.measured[k])
-        shown = made.shown()
-        information += shown[0][2]
-        error += shown[1][2]
-        assert shown[2][2] == pytest.approx(shown[0][2] * TERMS)
+        known, projection, squares, values = made.shown()
+        information += known[2, 0, 0]
+        error += projection[2, 0]
+        assert known[2] == pytest.approx(known[2, 0, 0] * np.outer(TERMS, TERMS))
+        assert k == 0 or values == sum(len(one.of) for one in drive.measured[k])
+        assert (squares > 0).all()
     before = made.read()
     posterior = 1 / (information + deviation**-2)
     weight, covariance = np.zeros((3, 10)), np.array([1e-12 * np.eye(10)] * 3)

@@ -24,12 +24,15 @@ from bayesrace.operation.closed_loop import ClosedLoop, built_in_car
 from bayesrace.operation.preparation import prepare
 from bayesrace.operation.settings import PreparationSettings
 from bayesrace.operation.terminal.terminal import stages_on
+from bayesrace.plant.simulator import Simulator
+from bayesrace.sensors import Sensors, get_sensors
 from bayesrace.vehicles import CarParameters
 from bayesrace.vehicles.models import e_kinematic
 from bayesrace.vehicles.parts import DcMotor
 from tests.conftest import CAUTIOUS, Circuit, Make
 from tests.cycle_rig import state
-from tests.racing import racing
+from tests.instruments import ROUGH, mocap
+from tests.racing import Racing, racing
 
 STEP_S = PREDICTION.step_s
 
@@ -346,22 +349,47 @@ def test_the_cycle_shows_states_in_a_row_of_a_car_that_moves(
     assert widening > 2 if widens else widening == 1.0
 
 
-@pytest.mark.check
-def test_a_car_that_has_lost_grip_since_it_was_learned_stays_on_the_track() -> None:
+def slippery(race: Racing) -> Simulator:
     """A fifth of the tyre forces of the car that the weights and the line are made for."""
+    return built_in_car(race.car.model_copy(update={"tyres": race.car.true_tyres.with_grip(0.8)}))
+
+
+@pytest.mark.check
+@pytest.mark.parametrize("sensors", [get_sensors("exact"), mocap(ROUGH)], ids=["exact", "1 mm"])
+def test_a_car_that_has_lost_grip_since_it_was_learned_stays_on_the_track(
+    sensors: Sensors,
+) -> None:
     race = racing("random:8")
-    slippery = built_in_car(
-        race.car.model_copy(update={"tyres": race.car.true_tyres.with_grip(0.8)})
-    )
     samples = []
     for mpc in (MpcSettings(caution=0.0), MpcSettings()):
         controller = compiled_controller(
             race.artefact, race.car, race.track, race.line, race.weights, mpc
         )
-        loop = ClosedLoop(race.car, race.track, race.line, controller, slippery)
-        samples.append(int((loop.drive(2).off_track_m > 0).sum()))
+        loop = ClosedLoop(
+            race.car, race.track, race.line, controller, slippery(race), sensors=sensors
+        )
+        driven = loop.drive(3)
+        samples.append(int((driven.off_track_m > 0).sum()))
     assert samples[0] > 10
     assert samples[1] == 0
+    assert len(driven.laps_s) == 3
+    assert driven.laps_s[2] < 6.0
+
+
+def test_estimates_that_the_mismatch_corrects_need_no_preparation(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """To the bit: a step that was not prepared in time is no other."""
+    race, prepare = racing(), Driver.prepare
+    driven = []
+    for made in (prepare, lambda *_: None):
+        monkeypatch.setattr(Driver, "prepare", made)
+        loop = ClosedLoop(
+            race.car, race.track, race.line, race.controller(), slippery(race), sensors=mocap(ROUGH)
+        )
+        driven.append(loop.drive(1, 4.0).x)
+    assert len(driven[0]) == 201
+    assert driven[0].tobytes() == driven[1].tobytes()
 
 
 @pytest.mark.check

@@ -134,6 +134,14 @@ void br_mpc_reset(br_mpc *mpc) {
     mpc->attempts = mpc->starts = mpc->futile = mpc->looks = 0;
 }
 
+static int valid_noise(const br_mpc_noise *noise) {
+    for (int i = 0; i < BR_NX; ++i)
+        if (!(noise->step[i] >= 0 && isfinite(noise->step[i]))) return 0;
+    return noise->values >= 0 && isfinite(noise->values) && br_all_finite(noise->squares, BR_NE) &&
+           br_all_finite(noise->projection[0], BR_NE * BR_NPHI) &&
+           br_all_finite(noise->information[0][0], BR_NE * BR_NPHI * BR_NPHI);
+}
+
 br_mpc_error br_mpc_observe(br_mpc *mpc, const double x[BR_NX], const double u[BR_NU],
                             double duration_s, const double x_next[BR_NX],
                             const br_mpc_noise *noise) {
@@ -142,19 +150,14 @@ br_mpc_error br_mpc_observe(br_mpc *mpc, const double x[BR_NX], const double u[B
     if (!br_plausible_state(x) || !br_plausible_state(x_next) ||
         !br_plausible(u, BR_INPUT_LIMIT, BR_NU))
         return BR_ERROR_STATE;
-    for (int i = 0; noise && i < BR_NX; ++i)
-        if (!(noise->step[i] >= 0 && isfinite(noise->step[i]))) return BR_ERROR_STATE;
-    for (int j = 0; noise && j < BR_NE; ++j)
-        if (!(noise->information[j] >= 0 && isfinite(noise->information[j] + noise->error[j]) &&
-              br_all_finite(noise->phi[j], BR_NPHI)))
-            return BR_ERROR_STATE;
+    if (noise && !valid_noise(noise)) return BR_ERROR_STATE;
     br_transition *newest = &mpc->mismatch.newest;
     newest->duration = duration_s;
     memcpy(newest->x, x, sizeof newest->x);
     memcpy(newest->u, u, sizeof newest->u);
     memcpy(newest->x_next, x_next, sizeof newest->x_next);
     newest->estimated = noise != NULL;
-    newest->noise = noise ? *noise : (br_mpc_noise){{0}, {0}, {0}, {{0}}};
+    newest->noise = noise ? *noise : (br_mpc_noise){.values = 0};
     mpc->watch.newest = *newest;
     return BR_OK;
 }

@@ -148,13 +148,14 @@ enum { BR_SAMPLES = 512, BR_WATCHED = 100 };
 
 enum { BR_NPHI = 1 + BR_NZ + BR_NE }; /* terms of the mismatch: see br_mismatch.c */
 
-/* Where the states before and after a step are estimates. Sums over the measurements between them,
- * weighted by what each says of an output's mismatch (information, of one that is the same
- * everywhere): of the error that it shows, and of the terms that this is the error at, which are
- * those of the last stages. */
+/* Where the states before and after a step are estimates. What the measurements between them say of
+ * the mismatch's weights w: for each output, what is new in them is by w + white noise of
+ * covariance S. Sums of by' S^-1 by, by' S^-1 new, new' S^-1 new, and of how many values there are.
+ */
 typedef struct {
     double step[BR_NX]; /* variance of the estimated step from the car's, whatever the model */
-    double information[BR_NE], error[BR_NE], phi[BR_NE][BR_NPHI];
+    double information[BR_NE][BR_NPHI][BR_NPHI], projection[BR_NE][BR_NPHI], squares[BR_NE];
+    double values;
 } br_mpc_noise;
 
 /* The mismatch of the weights that states are estimated by: w' phi for each output, per stage. */

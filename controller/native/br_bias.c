@@ -42,6 +42,12 @@ void br_bias_fade(int i, double left, br_estimate *b) {
         for (int k = 0; k < BR_NPHI; ++k) b->by_weight[j][k][i] *= left;
 }
 
+static double mean(const double weight[BR_NPHI], const double phi[BR_NPHI]) {
+    double sum = 0;
+    for (int k = 0; k < BR_NPHI; ++k) sum += weight[k] * phi[k];
+    return sum;
+}
+
 /* H U of an output. */
 static void observed(const br_estimate *b, const br_measurement *m, int output,
                      double by[BR_NX][BR_NPHI]) {
@@ -100,31 +106,33 @@ void br_estimator_covariance(const br_estimator *estimator, const br_estimate *b
     }
 }
 
-/* One number for each output, because these are learned one by one: what is new, along the
- * direction in which an error of the output shows that is the same everywhere. */
 void br_bias_learn(const br_estimator *estimator, const br_measurement *m, const br_estimate *b,
                    const double inverse[BR_NX][BR_NX], const double fresh[BR_NX],
                    br_mpc_noise *shown) {
+    const int n = m->count;
+    shown->values += b->biased ? n : 0;
     for (int j = 0; b->biased && j < BR_NE; ++j) {
-        double by[BR_NX][BR_NPHI];
+        double by[BR_NX][BR_NPHI], target[BR_NX];
         observed(b, m, j, by);
-        for (int a = 0; a < m->count; ++a) {
-            double along = 0, expected = 0;
-            for (int c = 0; c < m->count; ++c) along += inverse[a][c] * by[c][0];
-            for (int k = 0; k < BR_NPHI; ++k) {
-                expected += by[a][k] * estimator->weight[j][k];
-                shown->phi[j][k] += along * by[a][k];
+        for (int a = 0; a < n; ++a) target[a] = fresh[a] + mean(estimator->weight[j], by[a]);
+        for (int a = 0; a < n; ++a) {
+            double scaled[BR_NPHI] = {0}, left = 0; /* S^-1 by, S^-1 target */
+            for (int c = 0; c < n; ++c) {
+                for (int k = 0; k < BR_NPHI; ++k) scaled[k] += inverse[a][c] * by[c][k];
+                left += inverse[a][c] * target[c];
             }
-            shown->information[j] += along * by[a][0];
-            shown->error[j] += along * (fresh[a] + expected);
+            for (int k = 0; k < BR_NPHI; ++k) {
+                for (int l = 0; l < BR_NPHI; ++l)
+                    shown->information[j][k][l] += by[a][k] * scaled[l];
+                shown->projection[j][k] += by[a][k] * left;
+            }
+            shown->squares[j] += target[a] * left;
         }
     }
 }
 
 double br_bias_mean(const br_estimator *estimator, int output, const double phi[BR_NPHI]) {
-    double sum = 0;
-    for (int k = 0; k < BR_NPHI; ++k) sum += estimator->weight[output][k] * phi[k];
-    return sum;
+    return mean(estimator->weight[output], phi);
 }
 
 static void shift(const br_estimator *estimator, const br_mpc_mismatch *mismatch, br_estimate *b) {

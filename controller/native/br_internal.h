@@ -150,7 +150,8 @@ typedef struct {
 /* Of one output: what the errors of the corrected model say, older ones less, and what follows. */
 typedef struct {
     double information[BR_NPHI][BR_NPHI], projection[BR_NPHI]; /* sums of phi phi' / r, phi y / r */
-    double squares, precision, count;                          /* sums of y y / r, 1 / r, 1 */
+    double squares, precision, samples;                        /* sums of y y / r, 1 / r, 1 */
+    double values;      /* as many squares are independent: of samples, or of measurements */
     double surprise;    /* mean square of the newest errors, over that of all */
     double prior;       /* variance of a weight before anything has been seen */
     double noise_scale; /* mean square of what the weights leave, over r; ... */
@@ -159,6 +160,7 @@ typedef struct {
     double factor[BR_NPHI][BR_NPHI]; /* Cholesky factor of their inverse covariance, with the
                                         reciprocals of its diagonal */
     double unexplained;              /* variance of y beside r */
+    double doubt; /* square of the mean that is the variance of whether there is a mismatch */
 } br_regression;
 
 /* The model's mismatch, by what the car has done lately: see br_mismatch.c. */

@@ -42,6 +42,8 @@
 #define TELLING 0.1       /* of the residual's deviation: what errors have to be known to */
 #define EXPLAINED 1.5     /* mean square of errors over r up to which noise explains them */
 #define CHANCE 2.0        /* standard deviations by which a mean square may exceed that */
+#define ODDS 3.0          /* logarithm of those against a mismatch, before anything has been seen */
+#define LEAST_SHARE 1e-3  /* of weights that may be noise */
 
 static double feature_size(int a) {
     return BR_FEATURE[a] < BR_NX ? BR_STATE_DEVIATION[BR_FEATURE[a]]
@@ -91,6 +93,12 @@ static double dot(const double a[BR_NPHI], const double b[BR_NPHI]) {
     return sum;
 }
 
+/* What one transition says of an output's weights: sums over one error y at phi, or over the values
+ * of several measurements, which are whitened. */
+typedef struct {
+    double information[BR_NPHI][BR_NPHI], projection[BR_NPHI], squares, precision, values;
+} lesson;
+
 /* A single error that is far from what is usual is taken for a smaller one. usual: a variance. */
 static double clipped(double error, double usual) {
     const double most = LARGEST * sqrt(usual);
@@ -98,23 +106,23 @@ static double clipped(double error, double usual) {
 }
 
 /* Several in a row, and what was before says little of the car any more: the share that is kept of
- * it. */
-static double kept_share(br_regression *of, double error, double usual, double stages) {
-    of->surprise += fmin(stages / RECENT, 1) * (error * error / usual - of->surprise);
+ * it. square: of an error, over what is usual. */
+static double kept_share(br_regression *of, double square, double stages) {
+    of->surprise += fmin(stages / RECENT, 1) * (square - of->surprise);
     const double rate = BR_TS / REMEMBERED_S * fmax(of->surprise / SURPRISING, 1);
     return exp(-stages * fmin(rate, 1 / RECENT));
 }
 
-static void remember(br_regression *of, const double phi[BR_NPHI], double y, double r,
-                     double kept) {
+static void remember(br_regression *of, const lesson *new, double kept) {
     for (int a = 0; a < BR_NPHI; ++a) {
         for (int b = 0; b < BR_NPHI; ++b)
-            of->information[a][b] = kept * of->information[a][b] + phi[a] * phi[b] / r;
-        of->projection[a] = kept * of->projection[a] + phi[a] * y / r;
+            of->information[a][b] = kept * of->information[a][b] + new->information[a][b];
+        of->projection[a] = kept * of->projection[a] + new->projection[a];
     }
-    of->squares = kept * of->squares + y * y / r;
-    of->precision = kept * of->precision + 1 / r;
-    of->count = kept * of->count + 1;
+    of->squares = kept * of->squares + new->squares;
+    of->precision = kept * of->precision + new->precision;
+    of->samples = kept * of->samples + 1;
+    of->values = kept * of->values + new->values;
     if (!isfinite(of->squares + of->precision)) memset(of, 0, sizeof *of);
 }
 
@@ -161,76 +169,96 @@ static double mean_square_left(const br_regression *of) {
     double sum = of->squares;
     for (int a = 0; a < BR_NPHI; ++a)
         sum += of->weight[a] * (dot(of->information[a], of->weight) - 2 * of->projection[a]);
-    return sum / of->count;
+    return sum / of->values;
+}
+
+/* The mean over a model with weights and one without any (Bishop, section 14.1): what may be noise
+ * is no mismatch. For measurements, whose noise is known; the r of exact states is an upper bound.
+ */
+static void average(double evidence, br_regression *of) {
+    const double share = fmax(1 / (1 + exp(ODDS - evidence)), LEAST_SHARE);
+    of->doubt = (1 - share) / share;
+    for (int a = 0; a < BR_NPHI; ++a) {
+        of->weight[a] *= share;
+        for (int b = 0; b < a; ++b) of->factor[a][b] /= sqrt(share);
+        of->factor[a][a] *= sqrt(share);
+    }
 }
 
 /* The prior of the largest evidence is approached by a factor of four with each sample. */
-static void maximise_evidence(int output, br_regression *of) {
-    if (!(of->count > 0)) return;
-    const double r = of->count / of->precision;
+static void maximise_evidence(int output, int averaged, br_regression *of) {
+    if (!(of->samples > 0)) return;
+    const double r = of->samples / of->precision;
     const double middle = fmin(fmax(of->prior, LEAST_PRIOR * r), LARGEST_PRIOR * r);
     of->scaled_by = fmax(of->noise_scale, 1);
     const double less = regress(output, middle / 4, of), more = regress(output, middle * 4, of);
     const double same = regress(output, middle, of);
+    double evidence = same;
     of->prior = same >= fmax(less, more) ? middle : less > more ? middle / 4 : middle * 4;
-    if (of->prior != middle) regress(output, of->prior, of);
+    if (of->prior != middle) evidence = regress(output, of->prior, of);
     of->noise_scale = mean_square_left(of);
-    const double chance = CHANCE * sqrt(2 / of->count); /* chi-squared */
+    const double chance = CHANCE * sqrt(2 / of->values); /* chi-squared */
     of->unexplained = r * fmax(of->noise_scale - EXPLAINED - chance, 0);
+    of->doubt = 0;
+    if (averaged) average(evidence, of);
 }
 
 /* An error y of an output at phi, of variance r. */
-static void learn(br_mismatch *m, int output, const double phi[BR_NPHI], double y, double r,
-                  double stages) {
+static void learn_exact(br_mismatch *m, int output, const double phi[BR_NPHI], double y, double r,
+                        double stages) {
     br_regression *of = &m->of[output];
     if (!(r > 0 && isfinite(r))) return;
     const double expected = dot(m->weight[output], phi), usual = fmax(of->noise_scale, 1) * r;
-    const double error = clipped(y - expected, usual);
-    remember(of, phi, expected + error, r, kept_share(of, error, usual, stages));
-    maximise_evidence(output, of);
+    const double error = clipped(y - expected, usual), taken = expected + error;
+    lesson new = {.squares = taken * taken / r, .precision = 1 / r, .values = 1};
+    for (int a = 0; a < BR_NPHI; ++a) {
+        for (int b = 0; b < BR_NPHI; ++b) new.information[a][b] = phi[a] * phi[b] / r;
+        new.projection[a] = phi[a] * taken / r;
+    }
+    remember(of, &new, kept_share(of, error * error / usual, stages));
+    maximise_evidence(output, 0, of);
 }
 
-/* What exact states show. */
-static void learn_exact(br_mpc *mpc, const double variance[BR_NE]) {
+/* What measurements say, unless that is next to nothing: this would hide what others say, by its
+ * part in the usual r, which is that of an error at the same terms. */
+static void learn_estimated(br_mismatch *m, int output, const double phi[BR_NPHI],
+                            const br_mpc_noise *shown, double signal, double stages) {
+    br_regression *of = &m->of[output];
+    const double *w = m->weight[output];
+    lesson new = {.squares = shown->squares[output], .values = shown->values};
+    memcpy(new.information, shown->information[output], sizeof new.information);
+    memcpy(new.projection, shown->projection[output], sizeof new.projection);
+    double trace = 0, left = new.squares;
+    for (int a = 0; a < BR_NPHI; ++a) {
+        trace += new.information[a][a];
+        left += w[a] * (dot(new.information[a], w) - 2 * new.projection[a]);
+    }
+    new.precision = trace / dot(phi, phi);
+    if (!(new.precision * TELLING * TELLING * signal > 1)) return;
+    const double square = left / (new.values * fmax(of->noise_scale, 1));
+    remember(of, &new, kept_share(of, square, stages));
+    maximise_evidence(output, 1, of);
+}
+
+void br_mismatch_judge(br_mpc *mpc, const double variance[BR_NE]) {
     br_mismatch *m = &mpc->mismatch;
     const br_gp *gp = &mpc->gp[mpc->gp_in_use];
     const br_transition *due = &m->due;
     const double stages = due->duration / BR_TS;
     double end[BR_NX], phi[BR_NPHI];
     if (br_predict_by(mpc, gp, due->x, due->u, due->duration, end)) return;
+    memcpy(m->before, m->of, sizeof m->before);
+    m->judged = 1;
     br_mismatch_terms(due->x, due->u, end, stages, phi);
     for (int j = 0; j < BR_NE; ++j) {
         const int i = BR_CHANGED[j];
         const double share = mpc->stage[0].in_e[i][j] * stages, noise = gp->variance[j].noise;
-        if (share == 0) continue; /* nothing is known of this output */
         const double r = CORRELATED * fmax(variance[j] - noise, 0) + noise;
-        learn(m, j, phi, (due->x_next[i] - end[i]) / share, r, stages);
+        if (due->estimated)
+            learn_estimated(m, j, phi, &due->noise, gp->variance[j].signal, stages);
+        else if (share != 0) /* else nothing is known of this output */
+            learn_exact(m, j, phi, (due->x_next[i] - end[i]) / share, r, stages);
     }
-}
-
-/* What measurements show. One that says next to nothing would hide what others say, by its part in
- * the usual r. */
-static void learn_estimated(br_mpc *mpc) {
-    br_mismatch *m = &mpc->mismatch;
-    const br_gp *gp = &mpc->gp[mpc->gp_in_use];
-    const br_transition *due = &m->due;
-    for (int j = 0; j < BR_NE; ++j) {
-        const double r = 1 / due->noise.information[j];
-        double phi[BR_NPHI];
-        if (!(r < TELLING * TELLING * gp->variance[j].signal)) continue;
-        for (int a = 0; a < BR_NPHI; ++a) phi[a] = r * due->noise.phi[j][a];
-        learn(m, j, phi, r * due->noise.error[j], r, due->duration / BR_TS);
-    }
-}
-
-void br_mismatch_judge(br_mpc *mpc, const double variance[BR_NE]) {
-    br_mismatch *m = &mpc->mismatch;
-    memcpy(m->before, m->of, sizeof m->before);
-    m->judged = 1;
-    if (m->due.estimated)
-        learn_estimated(mpc);
-    else
-        learn_exact(mpc, variance);
 }
 
 /* --- in the plan --- */
@@ -253,15 +281,15 @@ static double of_weights(const br_regression *of, const double phi[BR_NPHI]) {
 
 double br_mismatch_unexplained(const br_mpc *mpc, const double phi[BR_NPHI], int output) {
     const br_regression *of = &mpc->mismatch.of[output];
-    if (!(of->count > 0)) return 0;
+    if (!(of->samples > 0)) return 0;
     const double mean = dot(of->weight, phi);
     const double leverage = of_weights(of, phi) * of->precision / (of->scaled_by * BR_NPHI);
-    return of->unexplained + NONLINEAR * NONLINEAR * leverage * mean * mean;
+    return of->unexplained + (of->doubt + NONLINEAR * NONLINEAR * leverage) * mean * mean;
 }
 
 double br_mismatch_variance(const br_mpc *mpc, const double phi[BR_NPHI], int output) {
     const br_regression *of = &mpc->mismatch.of[output];
-    if (!(of->count > 0)) return 0;
+    if (!(of->samples > 0)) return 0;
     return of_weights(of, phi) + br_mismatch_unexplained(mpc, phi, output);
 }
 

@@ -312,7 +312,7 @@ br_mpc_error br_get_mismatch(const br_mpc *mpc, const double v[BR_NV], br_mpc_mi
     memcpy(mismatch->weight, mpc->mismatch.weight, sizeof mismatch->weight);
     for (int j = 0; j < BR_NE; ++j) {
         const br_regression *of = &mpc->mismatch.of[j];
-        if (!(of->count > 0)) continue;
+        if (!(of->samples > 0)) continue;
         memcpy(mismatch->factor[j], of->factor, sizeof of->factor);
         mismatch->unexplained[j] = br_mismatch_unexplained(mpc, mismatch->phi, j);
     }

@@ -321,10 +321,14 @@ const char *br_cycle_fault_text(br_fault fault) {
 
 static void add(const br_mpc_noise *noise, br_mpc_noise *sum) {
     for (int i = 0; i < BR_NX; ++i) sum->step[i] += noise->step[i];
+    sum->values += noise->values;
     for (int j = 0; j < BR_NE; ++j) {
-        sum->information[j] += noise->information[j];
-        sum->error[j] += noise->error[j];
-        for (int k = 0; k < BR_NPHI; ++k) sum->phi[j][k] += noise->phi[j][k];
+        sum->squares[j] += noise->squares[j];
+        for (int k = 0; k < BR_NPHI; ++k) {
+            sum->projection[j][k] += noise->projection[j][k];
+            for (int l = 0; l < BR_NPHI; ++l)
+                sum->information[j][k][l] += noise->information[j][k][l];
+        }
     }
 }
 
