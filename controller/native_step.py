@@ -333,7 +333,9 @@ class NativeProblem:
         after = self._given("x_next", x_next, self._nx)
         noise = self._ffi.NULL
         if step_variance is not None:
-            noise = self._ffi.new("br_mpc_noise *", {"step": step_variance.tolist()})
+            variances = self._given("step_variance", step_variance, self._nx)
+            noise = self._ffi.new("br_mpc_noise *")
+            self._ffi.memmove(noise.step, variances, self._ffi.sizeof(noise.step))
         error = self._library.br_mpc_observe(self.handle, *given, duration_s, after, noise)
         self._check(error, "observe")
 

@@ -9,7 +9,8 @@
  * their variance, and where there are none, beside the model's acceleration along the car, in place
  * of its lateral motion, and beside a lag of the yaw rate in place of its yaw.
  *
- *   br_estimator_advance(estimator, time_s, u, residual, measurements, count);   each period
+ *   br_estimator_correct(estimator, &mismatch);                                  each period
+ *   br_estimator_advance(estimator, time_s, u, residual, measurements, count);
  *   br_estimator_read(estimator, &belief);
  *
  * As with br_mpc, an estimator lives in memory of the caller's, allocates nothing, and is for one
@@ -119,8 +120,10 @@ BR_API br_mpc_error br_estimator_set(br_estimator *estimator, const br_estimatio
 /* Knows nothing any more, and believes all instruments; counts stay. */
 BR_API void br_estimator_reset(br_estimator *estimator);
 
-/* The weights of the mismatch, from now on. What was estimated is what it would be if they had been
- * known before, to first order. */
+/* The mismatch, from now on: br_mpc_get_mismatch, before a period, whose residual has its phi, and
+ * its unexplained added to the variance. What was estimated is what it would be if these weights
+ * had been known before, to first order, unless the mismatch before was of other Gaussian
+ * processes. BR_ERROR_PARAMETERS for numbers that are not finite. */
 BR_API br_mpc_error br_estimator_correct(br_estimator *estimator, const br_mpc_mismatch *mismatch);
 
 /* The period that ends at time_s is over: u acted in it, and so much has been measured, in it or

@@ -22,6 +22,7 @@
 #define BAYESRACE_MPC_H
 
 #include <stddef.h>
+#include <stdint.h>
 
 #include "br_config.h"  /* generated: BR_N, BR_TS, BR_GP_CAPACITY, BR_MODEL_IDENTITY, BR_ABI */
 #include "br_problem.h" /* generated: sizes, BR_PARAMETERS, br_mpc_reference */
@@ -149,9 +150,8 @@ enum { BR_SAMPLES = 512, BR_WATCHED = 100 };
 enum { BR_NPHI = 1 + BR_NZ + BR_NE }; /* terms of the mismatch: see br_mismatch.c */
 
 /* Where the states before and after a step are estimates. What the measurements between them say of
- * the mismatch's weights w: for each output, what is new in them is by w + white noise of
- * covariance S. Sums of by' S^-1 by, by' S^-1 new, new' S^-1 new, and of how many values there are.
- */
+ * the mismatch's weights w: for each output they are y = B w + white noise of covariance S. Sums of
+ * B' S^-1 B, B' S^-1 y, y' S^-1 y, and of how many values there are. */
 typedef struct {
     double step[BR_NX]; /* variance of the estimated step from the car's, whatever the model */
     double information[BR_NE][BR_NPHI][BR_NPHI], projection[BR_NE][BR_NPHI], squares[BR_NE];
@@ -160,6 +160,7 @@ typedef struct {
 
 /* The mismatch of the weights that states are estimated by: w' phi for each output, per stage. */
 typedef struct {
+    uint64_t identity;             /* of the Gaussian processes' weights that err by it */
     double phi[BR_NPHI];           /* at the car's state and input; all 0: it is not estimated */
     double unexplained[BR_NE];     /* there, the variance of what no weights explain */
     double weight[BR_NE][BR_NPHI]; /* mean of w */
@@ -305,8 +306,9 @@ BR_API br_mpc_error br_mpc_solve(br_mpc *mpc, const double x[BR_NX], const doubl
  * of it from the step after the next on (info->widening), and the model is corrected by it from the
  * one after that on, until br_mpc_reset or other weights. For consecutive states of a car that
  * moves, about a stage apart, by the thread that steps; the newest before a step counts. Never
- * needed; without caution it changes nothing. noise: as an estimator has it; NULL: the states are
- * exact. BR_ERROR_TIME for a duration that is not above 0 and at most BR_PREDICT_MAX_S,
+ * needed; without caution it changes nothing. noise: as an estimator has it, and
+ * what it says of the mismatch counts, as estimates follow the model; NULL: the states are exact.
+ * BR_ERROR_TIME for a duration that is not above 0 and at most BR_PREDICT_MAX_S,
  * BR_ERROR_STATE as for br_mpc_predict.
  */
 BR_API br_mpc_error br_mpc_observe(br_mpc *mpc, const double x[BR_NX], const double u[BR_NU],

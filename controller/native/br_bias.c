@@ -11,7 +11,8 @@
  * and what is new in a measurement is H U (w - w_used), and white noise of covariance S. That is
  * what the regression learns from. Its weights, once others, move what was estimated by U times the
  * change, and their covariance M makes that of the estimate P + U M U'. All of it is exact for a
- * linear model and weights that stay the same.
+ * linear model, weights that stay the same, and measurements in order: one that comes late counts
+ * as if those that came before it had not.
  */
 #include "br_estimator.h"
 
@@ -144,14 +145,28 @@ static void shift(const br_estimator *estimator, const br_mpc_mismatch *mismatch
         }
 }
 
+static int finite(const br_mpc_mismatch *mismatch) {
+    double sum = 0; /* 0 * inf and 0 * nan are nan */
+    for (int j = 0; j < BR_NE; ++j)
+        for (int k = 0; k < BR_NPHI; ++k) {
+            sum += 0 * mismatch->phi[k] + 0 * mismatch->weight[j][k];
+            for (int l = 0; l < BR_NPHI; ++l) sum += 0 * mismatch->factor[j][k][l];
+        }
+    return sum == 0;
+}
+
 br_mpc_error br_estimator_correct(br_estimator *estimator, const br_mpc_mismatch *mismatch) {
     if (!estimator || !mismatch) return BR_ERROR_NULL;
-    const int estimated = mismatch->phi[0] != 0;
+    if (!finite(mismatch)) return BR_ERROR_PARAMETERS;
+    const int same = mismatch->phi[0] != 0 && mismatch->identity == estimator->identity;
     for (int e = 0; e < estimator->count; ++e) {
-        br_estimate *b = &br_estimator_event(estimator, e)->after;
-        if (b->biased && estimated) shift(estimator, mismatch, b);
-        b->biased &= estimated;
+        br_event *one = br_estimator_event(estimator, e);
+        if (one->after.biased && same) shift(estimator, mismatch, &one->after);
+        if (same) continue;
+        one->after.biased = 0; /* what was estimated by other weights stays as it was */
+        memset(one->residual.phi, 0, sizeof one->residual.phi);
     }
+    estimator->identity = mismatch->identity;
     memcpy(estimator->weight, mismatch->weight, sizeof estimator->weight);
     memcpy(estimator->factor, mismatch->factor, sizeof estimator->factor);
     for (int j = 0; j < BR_NE; ++j) estimator->uncertain[j] = mismatch->factor[j][0][0] > 0;

@@ -23,7 +23,7 @@ int br_stream_forget(br_stream *stream, br_counters *counters);
 
 typedef struct {
     double duration_s, x[BR_NX], u[BR_NU]; /* since a measured state; 0: nothing yet; mean input */
-    br_mpc_noise noise;                    /* all 0: of exact states */
+    br_mpc_noise noise;                    /* of estimated states */
 } br_shown;
 
 /* mpc NULL: another controller, which is shown nothing. noise: of the step between the two states;

@@ -374,6 +374,7 @@ static double widen(const br_estimator *estimator, const br_event *one) {
     if (!br_instrument_near(instrument, m, &one->after)) return 1;
     if (br_estimator_blind(estimator, &contradicted) && contradicted) return 1;
     br_estimate alone = one->after;
+    alone.biased = 0; /* by what grows */
     return fmin(fmax(take(estimator, INFINITY, m, &alone, NULL) / m->count, 1), WIDEST);
 }
 
@@ -402,13 +403,14 @@ static void judge(br_estimator *estimator, br_event *one) {
     const int possible =
         !estimator->agreed || !(gate > 0) || br_instrument_possible(&one->measured, &one->after);
     br_mpc_noise shown = estimator->observed;
-    double squared = possible ? take(estimator, gate, &one->measured, &with, &shown) : -1;
+    double squared =
+        possible ? take(estimator, gate, &one->measured, &with, first ? &shown : NULL) : -1;
     if (first && squared < 0) one->widening = widen(estimator, one);
     if (squared < 0 && one->widening > 1) {
         grow(one->widening, &one->after);
         with = one->after;
         shown = estimator->observed;
-        squared = take(estimator, gate, &one->measured, &with, &shown);
+        squared = take(estimator, gate, &one->measured, &with, first ? &shown : NULL);
     }
     if (first && !count(estimator, one, squared)) one->left_out = squared >= 0 || instrument->fault;
     if (squared < 0 || one->left_out) return;
@@ -463,6 +465,7 @@ static br_mpc_error period(br_estimator *estimator, const br_event *given,
     const br_event *newest = br_estimator_event(estimator, estimator->count - 1);
     const double duration = estimator->period_s = given->time_s - newest->time_s;
     br_event end = *given;
+    memset(&estimator->observed, 0, sizeof estimator->observed);
     end.after = newest->after;
     br_estimate predicted = newest->after;
     br_mpc_error error = br_estimator_reach(estimator, end.u, &end.residual, duration, &predicted);
@@ -502,10 +505,10 @@ br_mpc_error br_estimator_advance(br_estimator *estimator, double time_s, const 
         return BR_ERROR_NOT_READY;
     }
     if (anew) begin(estimator, pose, NULL);
-    memset(&estimator->observed, 0, sizeof estimator->observed);
     br_event end = {.time_s = time_s};
     memcpy(end.u, u, sizeof end.u);
     if (residual) end.residual = *residual;
+    if (estimator->walks) memset(end.residual.phi, 0, sizeof end.residual.phi);
     br_mpc_error error = period(estimator, &end, measurements, count, anew ? pose : NULL);
     const br_measurement before = estimator->pose;
     const double apart_s = pose && !anew ? pose->time_s - before.time_s : 0;

@@ -46,6 +46,7 @@ struct br_estimator {
     double posed_s;      /* of the newest pose that has been used; */
     br_measurement pose; /* the newest, used or not */
     int latched;         /* no instrument is believed again */
+    uint64_t identity;   /* as in br_mpc_mismatch: */
     double weight[BR_NE][BR_NPHI], factor[BR_NE][BR_NPHI][BR_NPHI]; /* as in br_mpc_mismatch */
     int uncertain[BR_NE];                                           /* there is such a factor */
     br_mpc_noise observed; /* of the mismatch, in the newest period */

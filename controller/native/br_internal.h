@@ -419,6 +419,11 @@ BR_PART __typeof__(br_mpc_steer) br_steer;
 
 /* --- br_mismatch.c: what the corrected model errs by lately --- */
 
+/* The regression that the weights in use are of, whether or not what is due has been judged. */
+static inline const br_regression *br_mismatch_used(const br_mismatch *mismatch, int output) {
+    return mismatch->judged ? &mismatch->before[output] : &mismatch->of[output];
+}
+
 BR_PART void br_mismatch_reset(br_mismatch *mismatch);
 /* A step has been made: what was observed before it is due. */
 BR_PART void br_mismatch_advance(br_mismatch *mismatch);
@@ -434,7 +439,7 @@ BR_PART void br_mismatch_terms(const double x[BR_NX], const double u[BR_NU],
 BR_PART void br_mismatch_mean(const br_mpc *mpc, const double phi[BR_NPHI], double error[BR_NE]);
 BR_PART double br_mismatch_variance(const br_mpc *mpc, const double phi[BR_NPHI], int output);
 /* The part of it that no weights explain. */
-BR_PART double br_mismatch_unexplained(const br_mpc *mpc, const double phi[BR_NPHI], int output);
+BR_PART double br_mismatch_unexplained(const br_regression *of, const double phi[BR_NPHI]);
 /* To a stage that is linearised without it, to first order in it. */
 BR_PART void br_mismatch_add(const br_mpc *mpc, const double x[BR_NX], const double u[BR_NU],
                              br_stage *stage);

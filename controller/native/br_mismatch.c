@@ -23,6 +23,9 @@
  * posterior's variance, CORRELATED times: errors of a smooth function resemble each other from one
  * stage to the next, so that many say no more than one.
  *
+ * Where states are estimated, measurements say more than they do: br_bias.c. Their noise is known,
+ * so that a regression always finds something; the mean is over models with weights and without.
+ *
  * What is observed before a step counts in the tube of the step after it and in the model of the
  * one after that, so that steps are the same with and without a preparation, and so are
  * predictions.
@@ -234,7 +237,7 @@ static void learn_estimated(br_mismatch *m, int output, const double phi[BR_NPHI
         left += w[a] * (dot(new.information[a], w) - 2 * new.projection[a]);
     }
     new.precision = trace / dot(phi, phi);
-    if (!(new.precision * TELLING * TELLING * signal > 1)) return;
+    if (!(new.values > 0 && new.precision * TELLING * TELLING * signal > 1)) return;
     const double square = left / (new.values * fmax(of->noise_scale, 1));
     remember(of, &new, kept_share(of, square, stages));
     maximise_evidence(output, 1, of);
@@ -279,8 +282,7 @@ static double of_weights(const br_regression *of, const double phi[BR_NPHI]) {
     return sum;
 }
 
-double br_mismatch_unexplained(const br_mpc *mpc, const double phi[BR_NPHI], int output) {
-    const br_regression *of = &mpc->mismatch.of[output];
+double br_mismatch_unexplained(const br_regression *of, const double phi[BR_NPHI]) {
     if (!(of->samples > 0)) return 0;
     const double mean = dot(of->weight, phi);
     const double leverage = of_weights(of, phi) * of->precision / (of->scaled_by * BR_NPHI);
@@ -290,7 +292,7 @@ double br_mismatch_unexplained(const br_mpc *mpc, const double phi[BR_NPHI], int
 double br_mismatch_variance(const br_mpc *mpc, const double phi[BR_NPHI], int output) {
     const br_regression *of = &mpc->mismatch.of[output];
     if (!(of->samples > 0)) return 0;
-    return of_weights(of, phi) + br_mismatch_unexplained(mpc, phi, output);
+    return of_weights(of, phi) + br_mismatch_unexplained(of, phi);
 }
 
 void br_mismatch_add(const br_mpc *mpc, const double x[BR_NX], const double u[BR_NU],

@@ -13,7 +13,8 @@
 /* P <- F P F' + Q, where what is beside the states stays. */
 static void spread(const double jacobian[BR_NX * BR_NX],
                    const double by_acceleration[BR_NX * BR_NE], const double q[BR_NX * BR_NX],
-                   const double phi[BR_NPHI], br_estimate *b) {
+                   const double by_mismatch[BR_NX * BR_NE], const double phi[BR_NPHI],
+                   br_estimate *b) {
     double f[BR_NX][BR_NA] = {{0}}, fp[BR_NX][BR_NA];
     for (int i = 0; i < BR_NX; ++i) {
         for (int l = 0; l < BR_NX; ++l) f[i][l] = jacobian[BR_NX * i + l];
@@ -33,7 +34,7 @@ static void spread(const double jacobian[BR_NX * BR_NX],
         }
         for (int j = BR_NX; j < BR_NA; ++j) b->p[i][j] = b->p[j][i] = fp[i][j];
     }
-    br_bias_move(f, by_acceleration, phi, b);
+    br_bias_move(f, by_mismatch, phi, b);
 }
 
 /* The yaw acceleration of a car that follows its steering angle, with a lag, as a car that
@@ -79,7 +80,7 @@ static br_mpc_error walk(const br_estimator *estimator, const br_estimate *b, co
     return BR_OK;
 }
 
-/* The largest acceleration of any car's: no model errs by more. */
+/* The car's largest acceleration (sensor monitor): no model errs by more. */
 static double largest(int j) {
     return BR_RATE[j] == BR_INDEX_OMEGA ? BR_MONITOR_YAW_ACCELERATION_RADPS2
                                         : BR_MONITOR_ACCELERATION_MPS2;
@@ -116,13 +117,15 @@ static void fade(const br_estimation *s, const br_residual *residual, double dur
 static br_mpc_error propagate(const br_estimator *estimator, const double u[BR_NU],
                               const br_residual *residual, double duration, br_estimate *b) {
     double f[BR_NX * BR_NX], by[BR_NX * BR_NE], q[BR_NX * BR_NX], begin[BR_NX], next[BR_NX];
-    double white[BR_NE], beside[BR_NE];
+    double white[BR_NE], beside[BR_NE], by_mismatch[BR_NX * BR_NE];
+    int limited[BR_NE];
     for (int i = 0; i < BR_NX; ++i) begin[i] = b->x[i] - b->way[i];
     for (int j = 0; j < BR_NE; ++j) {
         white[j] = residual->variance[j] - guessed(residual, j);
-        const double most = largest(j);
-        const double mismatch = br_bias_mean(estimator, j, residual->phi) / BR_TS;
-        beside[j] = fmin(fmax(mismatch, -most), most) + b->x[BR_NB + j];
+        const double most = largest(j), mean = br_bias_mean(estimator, j, residual->phi) / BR_TS;
+        const double mismatch = fmin(fmax(mean, -most), most);
+        limited[j] = mismatch != mean;
+        beside[j] = mismatch + b->x[BR_NB + j];
     }
     const br_mpc_error error = estimator->walks
                                    ? walk(estimator, b, u, duration, next, f, by, q)
@@ -133,7 +136,8 @@ static br_mpc_error propagate(const br_estimator *estimator, const double u[BR_N
         b->way[i] += next[i] - b->x[i];
         b->x[i] = next[i];
     }
-    spread(f, by, q, residual->phi, b);
+    for (int i = 0; i < BR_NX * BR_NE; ++i) by_mismatch[i] = limited[i % BR_NE] ? 0 : by[i];
+    spread(f, by, q, by_mismatch, residual->phi, b);
     const br_estimation *s = &estimator->settings;
     for (int i = 0; i < BR_NB; ++i)
         if (i < BR_NX || s->start[i] > 0) b->p[i][i] += duration * s->drift[i] * s->drift[i];

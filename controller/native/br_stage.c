@@ -308,13 +308,14 @@ br_mpc_error br_get_mismatch(const br_mpc *mpc, const double v[BR_NV], br_mpc_mi
     if (!mpc->caution.active || gp != believed(mpc)) return BR_OK;
     const br_mpc_error error = br_predict_by(mpc, gp, v, v + BR_NX, BR_TS, end);
     if (error) return error;
+    mismatch->identity = gp->identity;
     br_mismatch_terms(v, v + BR_NX, end, 1, mismatch->phi);
     memcpy(mismatch->weight, mpc->mismatch.weight, sizeof mismatch->weight);
     for (int j = 0; j < BR_NE; ++j) {
-        const br_regression *of = &mpc->mismatch.of[j];
+        const br_regression *of = br_mismatch_used(&mpc->mismatch, j);
         if (!(of->samples > 0)) continue;
         memcpy(mismatch->factor[j], of->factor, sizeof of->factor);
-        mismatch->unexplained[j] = br_mismatch_unexplained(mpc, mismatch->phi, j);
+        mismatch->unexplained[j] = br_mismatch_unexplained(of, mismatch->phi);
     }
     return BR_OK;
 }
