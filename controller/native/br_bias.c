@@ -145,7 +145,7 @@ static void shift(const br_estimator *estimator, const br_mpc_mismatch *mismatch
         }
 }
 
-static int finite(const br_mpc_mismatch *mismatch) {
+static int all_finite(const br_mpc_mismatch *mismatch) {
     double sum = 0; /* 0 * inf and 0 * nan are nan */
     for (int j = 0; j < BR_NE; ++j)
         for (int k = 0; k < BR_NPHI; ++k) {
@@ -157,7 +157,7 @@ static int finite(const br_mpc_mismatch *mismatch) {
 
 br_mpc_error br_estimator_correct(br_estimator *estimator, const br_mpc_mismatch *mismatch) {
     if (!estimator || !mismatch) return BR_ERROR_NULL;
-    if (!finite(mismatch)) return BR_ERROR_PARAMETERS;
+    if (!all_finite(mismatch)) return BR_ERROR_PARAMETERS;
     const int same = mismatch->phi[0] != 0 && mismatch->identity == estimator->identity;
     for (int e = 0; e < estimator->count; ++e) {
         br_event *one = br_estimator_event(estimator, e);
