@@ -171,25 +171,25 @@ def test_the_error_is_the_regression_of_what_was_observed(
     np.testing.assert_allclose(ours[3:6], of_state(x, u), rtol=0.2, atol=5e-3)
 
 
-def averaged(lessons: list[tuple[Floats, Floats, Floats]], odd: bool) -> Floats:
-    """Weights (10,) after all lessons, each of rows by (n, 10) and values (n,) with noise of
+def averaged(measurements: list[tuple[Floats, Floats, Floats]], odd: bool) -> Floats:
+    """Weights (10,) after all measurements, each of rows by (n, 10) and values (n,) with noise of
     variance 1, and terms; as above, and averaged with a model of no weights."""
     asymmetric = np.array([0, 0, 1, 1, 1, 0, 1, 0, 1, 1]) != odd
     share = np.where(asymmetric, 0.01, 1.0)
     weights, prior, excess, surprise = np.zeros(10), 0.0, 0.0, 0.0
     age = np.ones(0)
-    for n in range(1, len(lessons) + 1):
-        rows, y, _ = lessons[n - 1]
+    for n in range(1, len(measurements) + 1):
+        rows, y, _ = measurements[n - 1]
         off = float(((y - rows @ weights) ** 2).mean()) / max(excess, 1.0)
         surprise += (off - surprise) / 10
         age = np.append(age * np.exp(-min(STEP_S / 8 * max(surprise / 2, 1.0), 0.1)), 1.0)
         precision = sum(
             one * (rows**2).sum() / (phi @ phi)
-            for one, (rows, _, phi) in zip(age, lessons, strict=False)
+            for one, (rows, _, phi) in zip(age, measurements, strict=False)
         )
         usual = age.sum() / precision
-        all_rows = np.concatenate([rows for rows, _, _ in lessons[:n]])
-        values = np.concatenate([y for _, y, _ in lessons[:n]])
+        all_rows = np.concatenate([rows for rows, _, _ in measurements[:n]])
+        values = np.concatenate([y for _, y, _ in measurements[:n]])
         each = np.repeat(age, len(y))
         scaled = max(excess, 1.0) / each
         tried = np.clip(prior, 1e-4 * usual, 1e6 * usual) * np.array([0.25, 1.0, 4.0])
@@ -205,10 +205,10 @@ def averaged(lessons: list[tuple[Floats, Floats, Floats]], odd: bool) -> Floats:
 def test_what_measurements_say_is_averaged_with_no_mismatch(
     make: Make, step: NativeStep, car: CarParameters, circuit: Circuit, size: float
 ) -> None:
-    """Against NumPy, from all lessons at each step."""
+    """Against NumPy, from all measurements at each step."""
     plain, random, ffi = make(), np.random.default_rng(4), step.artefact.ffi
     true, x, u = size * random.normal(size=(3, 10)), circuit.start(), np.zeros(2)
-    lessons: list[list[tuple[Floats, Floats, Floats]]] = [[], [], []]
+    measurements: list[list[tuple[Floats, Floats, Floats]]] = [[], [], []]
     for _ in range(25):
         assert step.step(x, u).usable
         u, after = step.u.copy(), plain.predict(x, step.u, STEP_S)
@@ -216,7 +216,7 @@ def test_what_measurements_say_is_averaged_with_no_mismatch(
         for j in range(3):
             rows = 1e3 * random.normal(size=(3, 10))
             y = rows @ true[j] + random.normal(size=3)
-            lessons[j].append((rows, y, terms_of(plain, car, x, u)))
+            measurements[j].append((rows, y, terms_of(plain, car, x, u)))
             noise.information[j] = (rows.T @ rows).tolist()
             noise.projection[j] = (rows.T @ y).tolist()
             noise.squares[j] = float(y @ y)
@@ -226,7 +226,7 @@ def test_what_measurements_say_is_averaged_with_no_mismatch(
         )
         assert not error
         x = after
-    expected = np.array([averaged(one[:-2], j > 0) for j, one in enumerate(lessons)])
+    expected = np.array([averaged(one[:-2], j > 0) for j, one in enumerate(measurements)])
     ours = step.predict(x, u, STEP_S) - plain.predict(x, u, STEP_S)
     np.testing.assert_allclose(
         ours[3:6], expected @ terms_of(plain, car, x, u), rtol=1e-4, atol=1e-9

@@ -306,10 +306,10 @@ BR_API br_mpc_error br_mpc_solve(br_mpc *mpc, const double x[BR_NX], const doubl
  * of it from the step after the next on (info->widening), and the model is corrected by it from the
  * one after that on, until br_mpc_reset or other weights. For consecutive states of a car that
  * moves, about a stage apart, by the thread that steps; the newest before a step counts. Never
- * needed; without caution it changes nothing. noise: as an estimator has it, and
- * what it says of the mismatch counts, as estimates follow the model; NULL: the states are exact.
- * BR_ERROR_TIME for a duration that is not above 0 and at most BR_PREDICT_MAX_S,
- * BR_ERROR_STATE as for br_mpc_predict.
+ * needed; without caution it changes nothing. noise: as an estimator has it, and what it says of
+ * the mismatch counts, as estimates follow the model; NULL: the states are exact. BR_ERROR_TIME
+ * for a duration that is not above 0 and at most BR_PREDICT_MAX_S, BR_ERROR_STATE as for
+ * br_mpc_predict.
  */
 BR_API br_mpc_error br_mpc_observe(br_mpc *mpc, const double x[BR_NX], const double u[BR_NU],
                                    double duration_s, const double x_next[BR_NX],
@@ -350,6 +350,11 @@ BR_API br_mpc_error br_mpc_propagate(const br_mpc *mpc, const double x[BR_NX],
                                      double jacobian[BR_NX * BR_NX],
                                      double by_disturbance[BR_NX * BR_NE],
                                      double covariance[BR_NX * BR_NX]);
+
+/* What the corrected model errs by, as it is estimated from br_mpc_observe, at v = [x; u]; 0
+ * without caution and while estimates are by other weights than those in use. */
+BR_API br_mpc_error br_mpc_get_mismatch(const br_mpc *mpc, const double v[BR_NV],
+                                        br_mpc_mismatch *mismatch);
 
 #if BR_HAS_PATH
 /* The steering angle that keeps a car in state x by its line while it brakes to standstill.
@@ -394,11 +399,6 @@ BR_API br_instructions br_mpc_get_instructions(const br_mpc *mpc);
  * anything. */
 BR_API br_mpc_error br_mpc_variance(br_mpc *mpc, const double v[BR_NV], double variance[BR_NE],
                                     double noise[BR_NE]);
-
-/* What the corrected model errs by, as it is estimated from br_mpc_observe, at v; 0 without caution
- * and while estimates are by other weights than those in use. */
-BR_API br_mpc_error br_mpc_get_mismatch(const br_mpc *mpc, const double v[BR_NV],
-                                        br_mpc_mismatch *mismatch);
 
 /* Corrected model of the plan, with its mismatch, at v = [x; u]: x_next, J = d x_next / d v (row
  * major) and H = sum_i lambda_i d^2 x_next_i / d v^2. */

@@ -43,9 +43,9 @@ void br_bias_fade(int i, double left, br_estimate *b) {
         for (int k = 0; k < BR_NPHI; ++k) b->by_weight[j][k][i] *= left;
 }
 
-static double mean(const double weight[BR_NPHI], const double phi[BR_NPHI]) {
+double br_bias_mean(const br_estimator *estimator, int output, const double phi[BR_NPHI]) {
     double sum = 0;
-    for (int k = 0; k < BR_NPHI; ++k) sum += weight[k] * phi[k];
+    for (int k = 0; k < BR_NPHI; ++k) sum += estimator->weight[output][k] * phi[k];
     return sum;
 }
 
@@ -78,16 +78,25 @@ static void whiten(const br_estimator *estimator, int output, const double v[BR_
     }
 }
 
+/* Adds to a covariance of n numbers, whose rows are so far apart, what the weights of an output add
+ * to it: by M by', by how these numbers err with the weights. */
+static void add_uncertain(const br_estimator *estimator, int output, int n,
+                          double by[BR_NA][BR_NPHI], double *covariance, int apart) {
+    double white[BR_NA][BR_NPHI];
+    for (int a = 0; a < n; ++a) whiten(estimator, output, by[a], white[a]);
+    for (int a = 0; a < n; ++a)
+        for (int c = 0; c < n; ++c)
+            for (int k = 0; k < BR_NPHI; ++k)
+                covariance[apart * a + c] += white[a][k] * white[c][k];
+}
+
 void br_bias_widen(const br_estimator *estimator, const br_measurement *m, const br_estimate *b,
                    double s[BR_NX][BR_NX]) {
     for (int j = 0; b->biased && j < BR_NE; ++j) {
-        double by[BR_NX][BR_NPHI], white[BR_NX][BR_NPHI];
+        double by[BR_NA][BR_NPHI];
         if (!estimator->uncertain[j]) continue;
         observed(b, m, j, by);
-        for (int a = 0; a < m->count; ++a) whiten(estimator, j, by[a], white[a]);
-        for (int a = 0; a < m->count; ++a)
-            for (int c = 0; c < m->count; ++c)
-                for (int k = 0; k < BR_NPHI; ++k) s[a][c] += white[a][k] * white[c][k];
+        add_uncertain(estimator, j, m->count, by, s[0], BR_NX);
     }
 }
 
@@ -95,15 +104,11 @@ void br_estimator_covariance(const br_estimator *estimator, const br_estimate *b
                              double p[BR_NA][BR_NA]) {
     memcpy(p, b->p, sizeof b->p);
     for (int j = 0; b->biased && j < BR_NE; ++j) {
-        double by[BR_NPHI], white[BR_NA][BR_NPHI];
+        double by[BR_NA][BR_NPHI];
         if (!estimator->uncertain[j]) continue;
-        for (int i = 0; i < BR_NA; ++i) {
-            for (int k = 0; k < BR_NPHI; ++k) by[k] = b->by_weight[j][k][i];
-            whiten(estimator, j, by, white[i]);
-        }
         for (int i = 0; i < BR_NA; ++i)
-            for (int l = 0; l < BR_NA; ++l)
-                for (int k = 0; k < BR_NPHI; ++k) p[i][l] += white[i][k] * white[l][k];
+            for (int k = 0; k < BR_NPHI; ++k) by[i][k] = b->by_weight[j][k][i];
+        add_uncertain(estimator, j, BR_NA, by, p[0], BR_NA);
     }
 }
 
@@ -115,7 +120,7 @@ void br_bias_learn(const br_estimator *estimator, const br_measurement *m, const
     for (int j = 0; b->biased && j < BR_NE; ++j) {
         double by[BR_NX][BR_NPHI], target[BR_NX];
         observed(b, m, j, by);
-        for (int a = 0; a < n; ++a) target[a] = fresh[a] + mean(estimator->weight[j], by[a]);
+        for (int a = 0; a < n; ++a) target[a] = fresh[a] + br_bias_mean(estimator, j, by[a]);
         for (int a = 0; a < n; ++a) {
             double scaled[BR_NPHI] = {0}, left = 0; /* S^-1 by, S^-1 target */
             for (int c = 0; c < n; ++c) {
@@ -130,10 +135,6 @@ void br_bias_learn(const br_estimator *estimator, const br_measurement *m, const
             shown->squares[j] += target[a] * left;
         }
     }
-}
-
-double br_bias_mean(const br_estimator *estimator, int output, const double phi[BR_NPHI]) {
-    return mean(estimator->weight[output], phi);
 }
 
 static void shift(const br_estimator *estimator, const br_mpc_mismatch *mismatch, br_estimate *b) {

@@ -235,7 +235,7 @@ static void catch_up(br_cycle *cycle) {
     br_estimator *estimator = &cycle->estimator;
     const double newest_s = cycle->stream.newest.time_s, interval_s = cycle->counters.interval_s;
     if (cycle->unknown || !estimator->count || !(interval_s > 0)) return;
-    double last_s = br_estimator_event(estimator, estimator->count - 1)->time_s;
+    double last_s = br_estimator_newest(estimator)->time_s;
     if (newest_s - last_s > BR_LONGEST_S) return;
     for (; newest_s - last_s > 1.5 * interval_s; last_s += interval_s) {
         const double *u =
@@ -436,8 +436,7 @@ static int begin_step(br_cycle *cycle, double u[BR_NU]) {
     if (!cycle->mpc || !cycle->stream.newest.estimated) return at_acting(cycle, u, NULL);
     br_estimator *estimator = &cycle->estimator;
     br_carried carried = {.estimator = estimator,
-                          .residual =
-                              &br_estimator_event(estimator, estimator->count - 1)->residual,
+                          .residual = &br_estimator_newest(estimator)->residual,
                           .at = *br_estimator_now(estimator)};
     double covariance[BR_NX * BR_NX];
     if (at_acting(cycle, u, &carried)) return -1;

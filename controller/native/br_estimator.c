@@ -462,7 +462,7 @@ static br_mpc_error take_all(br_estimator *estimator, double time_s,
 static br_mpc_error period(br_estimator *estimator, const br_event *given,
                            const br_measurement *measurements, int count,
                            const br_measurement *begun_with) {
-    const br_event *newest = br_estimator_event(estimator, estimator->count - 1);
+    const br_event *newest = br_estimator_newest(estimator);
     const double duration = estimator->period_s = given->time_s - newest->time_s;
     br_event end = *given;
     memset(&estimator->observed, 0, sizeof estimator->observed);
@@ -471,7 +471,7 @@ static br_mpc_error period(br_estimator *estimator, const br_event *given,
     br_mpc_error error = br_estimator_reach(estimator, end.u, &end.residual, duration, &predicted);
     insert(estimator, estimator->count, &end);
     if (!error) error = take_all(estimator, end.time_s, measurements, count, begun_with);
-    newest = br_estimator_event(estimator, estimator->count - 1);
+    newest = br_estimator_newest(estimator);
     for (int i = 0; i < BR_NX; ++i)
         estimator->corrected[i] = fmax(predicted.p[i][i] - newest->after.p[i][i], 0);
     return error;
@@ -479,7 +479,7 @@ static br_mpc_error period(br_estimator *estimator, const br_event *given,
 
 /* Whether the newest period is too long ago; or, where there is a pose, the newest pose is. */
 static int outdated(br_estimator *estimator, double time_s, int pose) {
-    const double newest_s = br_estimator_event(estimator, estimator->count - 1)->time_s;
+    const double newest_s = br_estimator_newest(estimator)->time_s;
     if (time_s - newest_s > BR_LONGEST_S) return 1;
     int contradicted;
     br_estimator_blind(estimator, &contradicted);
@@ -526,7 +526,7 @@ br_mpc_error br_estimator_advance(br_estimator *estimator, double time_s, const 
 br_mpc_error br_estimator_read(const br_estimator *estimator, br_belief *out) {
     if (!estimator || !out) return BR_ERROR_NULL;
     if (!estimator->count) return BR_ERROR_NOT_READY;
-    const br_event *last = &estimator->events[estimator->order[estimator->count - 1]];
+    const br_event *last = br_estimator_newest(estimator);
     out->time_s = last->time_s;
     memcpy(out->x, last->after.x, sizeof out->x);
     double p[BR_NA][BR_NA];

@@ -57,8 +57,12 @@ static inline br_event *br_estimator_event(br_estimator *estimator, int k) {
     return &estimator->events[estimator->order[k]];
 }
 
-static inline const br_estimate *br_estimator_now(br_estimator *estimator) {
-    return &br_estimator_event(estimator, estimator->count - 1)->after;
+static inline const br_event *br_estimator_newest(const br_estimator *estimator) {
+    return &estimator->events[estimator->order[estimator->count - 1]];
+}
+
+static inline const br_estimate *br_estimator_now(const br_estimator *estimator) {
+    return &br_estimator_newest(estimator)->after;
 }
 
 /* What is expected of a measured state, its offset included. */

@@ -96,11 +96,11 @@ static double dot(const double a[BR_NPHI], const double b[BR_NPHI]) {
     return sum;
 }
 
-/* What one transition says of an output's weights: sums over one error y at phi, or over the values
- * of several measurements, which are whitened. */
+/* Sufficient statistics of an output's weights from one transition: of one error y at phi, or of
+ * the values of several measurements, which are whitened. */
 typedef struct {
     double information[BR_NPHI][BR_NPHI], projection[BR_NPHI], squares, precision, values;
-} lesson;
+} statistics;
 
 /* A single error that is far from what is usual is taken for a smaller one. usual: a variance. */
 static double clipped(double error, double usual) {
@@ -116,7 +116,7 @@ static double kept_share(br_regression *of, double square, double stages) {
     return exp(-stages * fmin(rate, 1 / RECENT));
 }
 
-static void remember(br_regression *of, const lesson *new, double kept) {
+static void remember(br_regression *of, const statistics *new, double kept) {
     for (int a = 0; a < BR_NPHI; ++a) {
         for (int b = 0; b < BR_NPHI; ++b)
             of->information[a][b] = kept * of->information[a][b] + new->information[a][b];
@@ -213,7 +213,7 @@ static void learn_exact(br_mismatch *m, int output, const double phi[BR_NPHI], d
     if (!(r > 0 && isfinite(r))) return;
     const double expected = dot(m->weight[output], phi), usual = fmax(of->noise_scale, 1) * r;
     const double error = clipped(y - expected, usual), taken = expected + error;
-    lesson new = {.squares = taken * taken / r, .precision = 1 / r, .values = 1};
+    statistics new = {.squares = taken * taken / r, .precision = 1 / r, .values = 1};
     for (int a = 0; a < BR_NPHI; ++a) {
         for (int b = 0; b < BR_NPHI; ++b) new.information[a][b] = phi[a] * phi[b] / r;
         new.projection[a] = phi[a] * taken / r;
@@ -228,7 +228,7 @@ static void learn_estimated(br_mismatch *m, int output, const double phi[BR_NPHI
                             const br_mpc_noise *shown, double signal, double stages) {
     br_regression *of = &m->of[output];
     const double *w = m->weight[output];
-    lesson new = {.squares = shown->squares[output], .values = shown->values};
+    statistics new = {.squares = shown->squares[output], .values = shown->values};
     memcpy(new.information, shown->information[output], sizeof new.information);
     memcpy(new.projection, shown->projection[output], sizeof new.projection);
     double trace = 0, left = new.squares;
@@ -271,7 +271,7 @@ void br_mismatch_mean(const br_mpc *mpc, const double phi[BR_NPHI], double error
 }
 
 /* phi' P phi */
-static double of_weights(const br_regression *of, const double phi[BR_NPHI]) {
+static double uncertain(const br_regression *of, const double phi[BR_NPHI]) {
     double solved[BR_NPHI], sum = 0;
     for (int a = 0; a < BR_NPHI; ++a) {
         solved[a] = phi[a];
@@ -282,17 +282,22 @@ static double of_weights(const br_regression *of, const double phi[BR_NPHI]) {
     return sum;
 }
 
-double br_mismatch_unexplained(const br_regression *of, const double phi[BR_NPHI]) {
-    if (!(of->samples > 0)) return 0;
+/* Variance of what no weights explain, by phi' P phi. */
+static double unexplained(const br_regression *of, const double phi[BR_NPHI], double of_weights) {
     const double mean = dot(of->weight, phi);
-    const double leverage = of_weights(of, phi) * of->precision / (of->scaled_by * BR_NPHI);
+    const double leverage = of_weights * of->precision / (of->scaled_by * BR_NPHI);
     return of->unexplained + (of->doubt + NONLINEAR * NONLINEAR * leverage) * mean * mean;
+}
+
+double br_mismatch_unexplained(const br_regression *of, const double phi[BR_NPHI]) {
+    return of->samples > 0 ? unexplained(of, phi, uncertain(of, phi)) : 0;
 }
 
 double br_mismatch_variance(const br_mpc *mpc, const double phi[BR_NPHI], int output) {
     const br_regression *of = &mpc->mismatch.of[output];
     if (!(of->samples > 0)) return 0;
-    return of_weights(of, phi) + br_mismatch_unexplained(of, phi);
+    const double of_weights = uncertain(of, phi);
+    return of_weights + unexplained(of, phi, of_weights);
 }
 
 void br_mismatch_add(const br_mpc *mpc, const double x[BR_NX], const double u[BR_NU],

@@ -168,7 +168,7 @@ br_mpc_error br_estimator_reach(const br_estimator *estimator, const double u[BR
 void br_estimator_noise(const br_estimator *estimator, br_mpc_noise *noise) {
     const double duration_s = estimator->period_s;
     const br_estimation *s = &estimator->settings;
-    const br_event *newest = &estimator->events[estimator->order[estimator->count - 1]];
+    const br_event *newest = br_estimator_newest(estimator);
     const br_estimate *now = &newest->after;
     double q[BR_NX], c[BR_NX];
     for (int i = 0; i < BR_NX; ++i) c[i] = q[i] = duration_s * s->drift[i] * s->drift[i];
