@@ -80,8 +80,8 @@ static void whiten(const br_estimator *estimator, int output, const double v[BR_
 
 /* Adds to a covariance of n numbers, whose rows are so far apart, what the weights of an output add
  * to it: by M by', by how these numbers err with the weights. */
-static void add_uncertain(const br_estimator *estimator, int output, int n,
-                          double by[BR_NA][BR_NPHI], double *covariance, int apart) {
+static void add_uncertain(const br_estimator *estimator, int output, int n, double by[][BR_NPHI],
+                          double *covariance, int apart) {
     double white[BR_NA][BR_NPHI];
     for (int a = 0; a < n; ++a) whiten(estimator, output, by[a], white[a]);
     for (int a = 0; a < n; ++a)
@@ -110,6 +110,17 @@ void br_estimator_covariance(const br_estimator *estimator, const br_estimate *b
             for (int k = 0; k < BR_NPHI; ++k) by[i][k] = b->by_weight[j][k][i];
         add_uncertain(estimator, j, BR_NA, by, p[0], BR_NA);
     }
+}
+
+double br_estimator_variance(const br_estimator *estimator, const br_estimate *b, int i) {
+    double variance = b->p[i][i];
+    for (int j = 0; b->biased && j < BR_NE; ++j) {
+        double by[1][BR_NPHI];
+        if (!estimator->uncertain[j]) continue;
+        for (int k = 0; k < BR_NPHI; ++k) by[0][k] = b->by_weight[j][k][i];
+        add_uncertain(estimator, j, 1, by, &variance, 1);
+    }
+    return variance;
 }
 
 void br_bias_learn(const br_estimator *estimator, const br_measurement *m, const br_estimate *b,

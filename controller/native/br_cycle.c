@@ -192,9 +192,8 @@ static void believe(br_cycle *cycle, double interval_s) {
 static br_fault doubtful(br_cycle *cycle, const br_estimate *now) {
     const double tolerance = fmax(cycle->settings.sensor_tolerance, 1);
     const double most_m = tolerance * BR_MONITOR_POSITION_M;
-    double p[BR_NA][BR_NA];
-    br_estimator_covariance(&cycle->estimator, now, p);
-    const double spread = p[BR_INDEX_X][BR_INDEX_X] + p[BR_INDEX_Y][BR_INDEX_Y];
+    const double spread = br_estimator_variance(&cycle->estimator, now, BR_INDEX_X) +
+                          br_estimator_variance(&cycle->estimator, now, BR_INDEX_Y);
     int contradicted;
     const br_fault found = br_estimator_blind(&cycle->estimator, &contradicted);
     const int unknown = spread > most_m * most_m;

@@ -99,7 +99,8 @@ void br_bias_learn(const br_estimator *estimator, const br_measurement *m, const
 /* w' phi of an output. */
 double br_bias_mean(const br_estimator *estimator, int output, const double phi[BR_NPHI]);
 
-/* The covariance of an estimate, all included. */
+/* The covariance of an estimate, all included; the variance of its i-th state. */
+double br_estimator_variance(const br_estimator *estimator, const br_estimate *b, int i);
 void br_estimator_covariance(const br_estimator *estimator, const br_estimate *b,
                              double p[BR_NA][BR_NA]);
 
