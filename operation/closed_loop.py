@@ -52,8 +52,10 @@ from bayesrace.tracks import PathProjection, Track
 from bayesrace.vehicles import CarParameters
 from bayesrace.vehicles.models import dynamic
 
-__all__ = ["ClosedLoop", "Driven", "built_in_car"]
+__all__ = ["ClosedLoop", "Driven", "Watch", "built_in_car"]
 
+Watch = Callable[[Sequence[float]], End | None]
+"""Sees each true state (7,) of a run, and may end it."""
 
 _EPOCH: Final = 1
 
@@ -192,7 +194,7 @@ class ClosedLoop:
         start_speed_mps: float = 0.1,
         x0: Sequence[float] | None = None,
         name: str = "",
-        watch: Callable[[Sequence[float]], End | None] = lambda _: None,
+        watch: Watch = lambda _: None,
     ) -> Driven:
         """Drives until the laps are done (0: no limit), the time is up, or ``watch`` of a true
         state (7,) returns an end.

@@ -8,6 +8,10 @@ the line is too fast everywhere, and so it is if the fallback has to brake often
 was lost sight of. Where states are estimated drives that have failed are learned from as well: most
 do, and up to there they were the fastest ones. Of exact states the last drive says enough, and what
 a car does that slides off is a model's worst part to learn.
+
+Far from the edges bends are tight, and no drive is as fast as a racing line is in its wide ones.
+What is missing is driven in practice: laps of the same track, on its racing line, by the controller
+with what it has learned so far.
 """
 
 from collections.abc import Sequence
@@ -18,10 +22,11 @@ from typing import Final
 import numpy as np
 
 from bayesrace.arrays import Flags, Floats
+from bayesrace.controller.interface import Controller
 from bayesrace.controller.pure_pursuit import DrivingStyle, PurePursuit, PurePursuitSettings
 from bayesrace.controller.python_controller import PythonController
 from bayesrace.log import LogWriter
-from bayesrace.operation.closed_loop import ClosedLoop, Driven, built_in_car
+from bayesrace.operation.closed_loop import ClosedLoop, Driven, Watch, built_in_car
 from bayesrace.plant.car import End
 from bayesrace.plant.vehicle import FmuFault, Vehicle
 from bayesrace.raceline import RaceLine, RaceLineSettings, read_raceline_for
@@ -32,7 +37,7 @@ from bayesrace.tracks.spline import fit_arc_length
 from bayesrace.vehicles import CarParameters, car_text
 
 __all__ = [
-    "collect", "drive_length_s", "pursuit_controller", "room_beside", "slower_before",
+    "collect", "drive_length_s", "practise", "pursuit_controller", "room_beside", "slower_before",
     "training_line", "training_margin_m",
 ]  # fmt: skip
 
@@ -99,9 +104,7 @@ def collect(
     def pursuit() -> PurePursuit:
         return PurePursuit(car, followed.x_m, followed.y_m, speeds, settings, room_m=room_m)
 
-    def watch(x: Sequence[float]) -> End | None:
-        return _FAILED if sensors.root and _failing(track, car, np.array([x]))[0] else None
-
+    watch = _until_it_fails(track, car) if sensors.root else _to_its_end
     least_s = min(duration_s, _lap_length_s(car, line))
     slowed, driven, log = np.ones(len(speeds)), list[Driven](), None
     try:
@@ -130,6 +133,49 @@ def collect(
         if log is not None:
             log.close()
     return driven
+
+
+def practise(
+    track: Track,
+    line: RaceLine,
+    car: CarParameters,
+    controller: Controller,
+    path: Path,
+    laps: int,
+    seed: int,
+    start_speed_mps: float = 0.1,
+    vehicle: Vehicle | None = None,
+    sensors: Sensors = EXACT,
+    delay_s: float = 0.0,
+) -> Driven:
+    """Drives laps of a training track with the controller, logged at ``path``, up to where the car
+    leaves the track or spins.
+
+    ``vehicle``, ``sensors``, ``seed``, ``delay_s``: as in :class:`ClosedLoop`. Raises FmuFault if
+    what simulates the car fails.
+    """
+    log = LogWriter(path, {"practice": {"track": track.name, "car": car_text(car)}})
+    try:
+        loop = ClosedLoop(
+            car, track, line, controller, vehicle, log,
+            sensors=sensors, seed=seed, delay_s=delay_s,
+        )  # fmt: skip
+        watch = _until_it_fails(track, car)
+        driven = loop.drive(laps, start_speed_mps=start_speed_mps, name="practice", watch=watch)
+    finally:
+        log.close()
+    if driven.end.reason == "plant_fault":
+        raise FmuFault(driven.end.text)
+    return driven
+
+
+def _until_it_fails(track: Track, car: CarParameters) -> Watch:
+    """Ends a drive where the true car leaves the track or spins."""
+    return lambda x: _FAILED if _failing(track, car, np.array([x]))[0] else None
+
+
+def _to_its_end(_: Sequence[float]) -> None:
+    """Ends no drive."""
 
 
 def _slower_after(one: Driven, line: RaceLine, slowed: Floats) -> tuple[Floats, float]:

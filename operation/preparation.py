@@ -1,11 +1,11 @@
-"""What is made before anything can be driven: racing lines, training drive, weights, controllers.
+"""What is made before anything can be driven: racing lines, training drives, weights, controllers.
 
 Each depends on settings, files and code alone, is kept in the cache under a digest of all of them,
 and is made only if it is not there. ``race``, ``bench`` and ``latency`` prepare by :func:`prepare`.
 """
 
-from collections.abc import Sequence
-from contextlib import suppress
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final, Literal
@@ -15,6 +15,7 @@ from bayesrace.codegen.build import build
 from bayesrace.codegen.compiler import compiled, find_compiler
 from bayesrace.codegen.settings import BuildSettings
 from bayesrace.columns import LogColumns
+from bayesrace.controller.assembly import compiled_controller
 from bayesrace.errors import InputError
 from bayesrace.files import read_whole, replacing
 from bayesrace.gp.weights import encode_weights, read_weights, write_weights
@@ -25,11 +26,11 @@ from bayesrace.learning.sources import CYCLES, STATES, dataset_from_columns
 from bayesrace.manifest import opened_library, read_manifest
 from bayesrace.messages import STATE, TELEMETRY
 from bayesrace.operation.closed_loop import Driven
-from bayesrace.operation.collect import collect, drive_length_s, training_margin_m
+from bayesrace.operation.collect import collect, drive_length_s, practise, training_margin_m
 from bayesrace.operation.settings import PreparationSettings
 from bayesrace.operation.terminal.terminal import Stages
 from bayesrace.plant.simulator import PLANT
-from bayesrace.plant.vehicle import open_vehicle
+from bayesrace.plant.vehicle import Vehicle, open_vehicle
 from bayesrace.raceline import (
     RaceLine,
     RaceLineError,
@@ -88,11 +89,14 @@ class PreparedTrack:
 
 @dataclass(frozen=True, eq=False)
 class Training:
-    """The training drives, and what can be learned from them."""
+    """The training drives, or the practice, and what can be learned from them."""
 
     driven_on: PreparedTrack
     log: Path
     samples: Dataset
+    """Of the drives and of the practice."""
+    practice: "Training | None" = None
+    """The controller's own laps after the training drives, if it has practised."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,6 +167,14 @@ def prepare(
         with stages.stage("train the residual") as stage:
             learned = training.samples, settings.discretisation, training_settings(settings)
             weights = trained_weights(*learned, progress=stage.update)
+        if settings.practised_laps:
+            with stages.stage(f"practice, {train_track.name}"):
+                on = _prepared_track(train_track, car, settings.raceline)
+                practice = _practice(on, car, settings, artefacts[0], weights)
+            with stages.stage("train the residual with practice") as stage:
+                samples = [training.samples, practice.samples]
+                weights = updated_weights(samples, settings, weights, stage.update)
+            training = replace(training, samples=concatenate(samples), practice=practice)
     return Prepared(tuple(prepared_tracks), training, weights, tuple(artefacts))
 
 
@@ -199,26 +211,63 @@ def _training_track(track: Track, car: CarParameters, settings: RaceLineSettings
 
 
 def _training_drive(
-    prepared: PreparedTrack, car: CarParameters, settings: PreparationSettings, artefact: Path
+    on: PreparedTrack, car: CarParameters, settings: PreparationSettings, artefact: Path
 ) -> Training:
     """The pure-pursuit drive, from the cache if it is there; its log is like a race's."""
+
+    def make(partial: Path) -> None:
+        drive_for_training(settings, on.track, on.line, car, artefact, partial)
+
+    duration_s = _drive_s(settings, car, on.line)
+    return _kept_drive("drive", on, car, settings, make, f"{duration_s!r}")
+
+
+def _practice(
+    on: PreparedTrack,
+    car: CarParameters,
+    settings: PreparationSettings,
+    artefact: Path,
+    weights: Path,
+) -> Training:
+    """The controller's own laps, from the cache if they are there."""
+    learned = read_weights(weights)
+
+    def make(partial: Path) -> None:
+        controller = compiled_controller(artefact, car, on.track, on.line, learned)
+        with _vehicle(settings) as vehicle:
+            practise(
+                on.track, on.line, car, controller, partial, settings.practised_laps,
+                settings.seed, settings.start_speed_mps, vehicle, settings.instruments,
+                settings.delay_s,
+            )  # fmt: skip
+
+    by = artefact.name, learned.version, f"{settings.practised_laps}"
+    return _kept_drive("practice", on, car, settings, make, *by)
+
+
+def _kept_drive(
+    name: str,
+    on: PreparedTrack,
+    car: CarParameters,
+    settings: PreparationSettings,
+    make: Callable[[Path], None],
+    *inputs: str,
+) -> Training:
+    """A drive that is logged; driven by ``make`` only if these arguments are new."""
     files = [path for path in (settings.fmu, settings.fmu_map) if path is not None]
     others = [] if settings.simulator == "equations" else [settings.simulator]
-    track, line = prepared.track, prepared.line
-    duration_s = _drive_s(settings, car, line)
+    line = on.line
     path = _place(
-        "drive-{}.mcap", ("mcap", *others),
-        track.identity,
+        name + "-{}.mcap", ("mcap", *others),
+        on.track.identity,
         *(column.tobytes() for column in (line.s_m, line.x_m, line.y_m, line.vx_mps)),
         car.model_dump_json(),
         settings.model_dump_json(include=_SHAPES_A_DRIVE),
         settings.instruments.model_dump_json(),
-        f"{duration_s!r} {len(files)}",
+        f"{len(files)}",
+        *inputs,
         *(read_whole(path, "the FMU or its map", _LARGEST_FMU) for path in files),
     )  # fmt: skip
-
-    def make(partial: Path) -> None:
-        drive_for_training(settings, track, line, car, artefact, partial)
 
     def read(log: Path) -> Dataset:
         columns = LogColumns(log, {STATE: STATES, TELEMETRY: CYCLES}).read()
@@ -227,7 +276,7 @@ def _training_drive(
         step_s = settings.discretisation.step_s
         return dataset_from_columns(columns[STATE], columns[TELEMETRY], car, step_s)
 
-    return Training(prepared, path, kept(path, make, read))
+    return Training(on, path, kept(path, make, read))
 
 
 def _drive_s(settings: PreparationSettings, car: CarParameters, line: RaceLine) -> float:
@@ -250,12 +299,17 @@ def drive_for_training(
     """
     pursuit = settings.pursuit.model_copy(update={"seed": settings.seed})
     duration_s = _drive_s(settings, car, line)
-    simulated_by = settings.true_car, settings.fmu, settings.fmu_map, 1 / PLANT.step_s, compiled
-    with open_vehicle(*simulated_by, simulator=settings.simulator) as vehicle:
+    with _vehicle(settings) as vehicle:
         return collect(
             track, line, car, artefact, log, duration_s, pursuit,
             settings.start_speed_mps, vehicle, settings.instruments, settings.delay_s,
         )  # fmt: skip
+
+
+def _vehicle(settings: PreparationSettings) -> AbstractContextManager[Vehicle]:
+    """What simulates the car of the settings."""
+    simulated_by = settings.true_car, settings.fmu, settings.fmu_map, 1 / PLANT.step_s, compiled
+    return open_vehicle(*simulated_by, simulator=settings.simulator)
 
 
 def training_settings(settings: PreparationSettings) -> TrainingSettings:

@@ -164,6 +164,9 @@ def _prepared(settings: RaceSettings, out: Path, stages: Stages) -> Prepared:
     if prepared.training is not None:
         _kept(prepared.training.driven_on, out, "train")
         shutil.copyfile(prepared.training.log, out / "collect.mcap")
+        if (practice := prepared.training.practice) is not None:
+            _kept(practice.driven_on, out, "practice")
+            shutil.copyfile(practice.log, out / "practice.mcap")
     for model, folder in zip(models, prepared.artefacts, strict=True):
         shutil.copyfile(folder / MANIFEST, out / f"manifest-{model}.json")
     weights = Path(shutil.copyfile(prepared.weights, out / "weights-bayesrace.bin"))

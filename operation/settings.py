@@ -1,7 +1,7 @@
 """Settings of a race, as one resolved object that goes into the run directory."""
 
 from pathlib import Path
-from typing import Annotated, Literal, Self
+from typing import Annotated, Final, Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -19,6 +19,9 @@ __all__ = ["BayesianSettings", "PreparationSettings", "RaceSettings", "TimeMode"
 
 TimeMode = Literal["lockstep", "realtime"]
 """How time passes in a run."""
+
+_PRACTICE_LAPS: Final = 3
+"""Where states are estimated."""
 
 
 class PreparationSettings(CarSimulation):
@@ -48,6 +51,13 @@ class PreparationSettings(CarSimulation):
         ge=1,
         le=3600,
         description="length of the training drives [s]; None: the car's, and a lap at least",
+    )
+    practice_laps: int | None = Field(
+        None,
+        ge=0,
+        le=100,
+        description="laps of the training track by the controller itself, which it learns from "
+        "before it races; None: 3 where states are estimated, none where they are measured",
     )
     points: int = Field(400, ge=20, le=1024, description="training points per output")
     kernels: tuple[Kernel, ...] = Field(
@@ -79,6 +89,13 @@ class PreparationSettings(CarSimulation):
         """What is not stated and the car knows."""
         object.__setattr__(self, "train_track", self.train_track or self.car.train_track)
         return self
+
+    @property
+    def practised_laps(self) -> int:
+        """Laps of the training track by the controller itself."""
+        if self.practice_laps is None:
+            return _PRACTICE_LAPS if self.instruments.root else 0
+        return self.practice_laps
 
     @property
     def driven_car(self) -> CarParameters:

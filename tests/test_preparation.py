@@ -3,18 +3,22 @@
 import io
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 from rich.console import Console
 
 from bayesrace.errors import InputError
-from bayesrace.gp.weights import GpWeights
+from bayesrace.gp.weights import GpWeights, read_weights
+from bayesrace.learning.dataset import Dataset
 from bayesrace.manifest import LIBRARY
 from bayesrace.operation.preparation import Prepared, prepare
 from bayesrace.operation.settings import PreparationSettings
 from bayesrace.operation.terminal.terminal import stages_on
 from bayesrace.raceline import RaceLineSettings
+from bayesrace.sensors import get_sensors
 from bayesrace.tracks import Track
 from tests.car_fmu import packed_car
 from tests.conftest import offset_line
@@ -123,6 +127,45 @@ def test_the_training_drive_is_kept_for_all_that_shapes_it(preparing: Preparing)
         assert prepared.training is not None
         logs.add(prepared.training.log)
     assert len(logs) == 8
+
+
+def test_the_controller_learns_from_its_own_laps_of_the_training_track(
+    preparing: Preparing, weights: GpWeights, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    learned: list[tuple[Dataset, GpWeights | None]] = []
+
+    def train(samples: Dataset, *more: Any) -> GpWeights:
+        learned.append((samples, more[2]))
+        return replace(weights, version=f"round {len(learned)}")
+
+    monkeypatch.setattr("bayesrace.learning.training.train", train)
+    prepared, _ = preparing(practice_laps=1)
+    training = prepared.training
+    assert training is not None
+    assert training.practice is not None
+    (driven, none), (samples, begun_with) = learned
+    assert none is None
+    assert begun_with is not None
+    assert begun_with.version == "round 1"
+    assert samples.digest() == training.samples.digest()
+    assert len(training.practice.samples) > 50
+    assert len(samples) == len(driven) + len(training.practice.samples)
+    assert read_weights(prepared.weights).version == "round 2"
+    again, stages = preparing(practice_laps=1)
+    assert "practice, random" in stages
+    assert again.weights == prepared.weights
+    assert len(learned) == 2
+    without, _ = preparing(practice_laps=0)
+    assert without.training is not None
+    assert without.training.practice is None
+    assert without.training.log == training.log
+
+
+def test_there_is_practice_where_states_are_estimated() -> None:
+    assert PreparationSettings().practised_laps == 0
+    estimated = PreparationSettings(sensors=get_sensors("mocap"))
+    assert estimated.practised_laps == 3
+    assert estimated.model_copy(update={"practice_laps": 0}).practised_laps == 0
 
 
 def test_a_track_without_the_room_is_trained_on_with_less(

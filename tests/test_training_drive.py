@@ -28,13 +28,16 @@ from bayesrace.operation.collect import (
     training_margin_m,
 )
 from bayesrace.operation.report import write_report
+from bayesrace.operation.settings import RaceSettings
 from bayesrace.operation.terminal.tables import print_table
 from bayesrace.raceline import RaceLine, write_raceline
 from bayesrace.sensors import get_sensors
+from bayesrace.studies.campaign.case import Case, run_case
 from bayesrace.tracks import Track, load_track, write_track
 from bayesrace.vehicles import get_car
 from tests.command_line import Cli
 from tests.conftest import offset_line
+from tests.instruments import ROUGH, mocap
 from tests.synthetic_race import Drive, analyse, circle, write_race
 from tests.test_analysis import TWO_LAPS
 
@@ -229,3 +232,29 @@ def test_a_race_reports_its_training_drive(
     assert said in page
     section = page.split('<section id="training">')[1].split("</section>")[0]
     assert section.count("<svg ") == 1  # the map
+    for name in ("train.csv", "train_raceline.csv"):
+        shutil.copyfile(run / name, run / name.replace("train", "practice"))
+    shutil.copyfile(driven["calm"][1], run / "practice.mcap")
+    practised = analyse(run)
+    assert practised.training == training
+    assert practised.practice is not None
+    assert practised.practice.lap_times_s == list(driven["calm"][0].laps_s)
+    print_table(practised, Console(file=text, width=200))
+    assert f"practice on paddock: laps {driven['calm'][0].laps_s[0]:.3f}" in text.getvalue()
+    page = write_report(run).read_text()
+    section = page.split('<section id="training">')[1].split("</section>")[0]
+    assert section.count("<svg ") == 2
+
+
+@pytest.mark.check
+@pytest.mark.parametrize("track", ["random:45", "random:47"])
+def test_first_laps_after_practice_are_as_fast_as_those_of_a_controller_that_knows_the_car(
+    track: str,
+) -> None:
+    """By poses of 1 mm and 0.5 degrees, where without practice they were 1.2 % slower."""
+    settings = RaceSettings(track=track, seed=3, laps=3, sensors=mocap(ROUGH))
+    rows = run_case(Case(settings, ("bayesrace", "bestcase")).task(), {})
+    assert not any(row["off_track_samples"] for row in rows)
+    flying = {who: [row["lap_time_s"] for row in rows if row["controller"] == who][1:]
+              for who in ("bayesrace", "bestcase")}  # fmt: skip
+    assert max(flying["bayesrace"]) < 1.01 * max(flying["bestcase"])

@@ -28,7 +28,13 @@ from bayesrace.operation.analysis.laps import (
     time_laps,
     trajectory_digest,
 )
-from bayesrace.operation.analysis.recording import LIMIT_FILES, Recording, RunRecord, read_recording
+from bayesrace.operation.analysis.recording import (
+    LIMIT_FILES,
+    Recording,
+    RunRecord,
+    TrainingRecord,
+    read_recording,
+)
 from bayesrace.operation.analysis.results import (
     LapResult,
     Percentiles,
@@ -192,6 +198,10 @@ def _percentiles(values: Floats) -> Percentiles | None:
     return Percentiles(p50=float(p50), p99=float(p99), max=float(largest))
 
 
+def _training_run(found: TrainingRecord | None) -> DrivenRun | None:
+    return None if found is None else DrivenRun(found.run, found.track, found.line, whole=True)
+
+
 class RaceAnalysis:
     """A recording with all that is computed from it, each thing once."""
 
@@ -211,8 +221,12 @@ class RaceAnalysis:
     @cached_property
     def training(self) -> DrivenRun | None:
         """The last training drive, all of it; None where weights were given."""
-        found = self.recording.training
-        return None if found is None else DrivenRun(found.run, found.track, found.line, whole=True)
+        return _training_run(self.recording.training)
+
+    @cached_property
+    def practice(self) -> DrivenRun | None:
+        """The controller's own laps after the training drives, all of them; None without."""
+        return _training_run(self.recording.practice)
 
     @cached_property
     def best_case(self) -> Dataset | None:
@@ -252,6 +266,7 @@ class RaceAnalysis:
             laps=[run.result(recording.settings.laps, limit_s) for run in self.runs],
             limit_s=limit_s,
             training=None if self.training is None else self.training.result(),
+            practice=None if self.practice is None else self.practice.result(),
             gp=metrics.get("bayesrace", {}),
             gp_updated=metrics.get("bayesrace-updated", {}),
             real_time_factor=_real_time_factor(recording.runs),

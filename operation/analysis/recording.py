@@ -168,7 +168,8 @@ def _of_run(rows: Columns, run: int) -> Columns:
 
 @dataclass(frozen=True, eq=False)
 class TrainingRecord:
-    """The last training drive of a race, with the track and the line that it was driven on."""
+    """The last training drive of a race, or the controller's practice, with the track and the line
+    that it was driven on."""
 
     run: RunRecord
     track: Track
@@ -209,9 +210,11 @@ class Recording:
     truth: bool
     """The log holds the truth; without it, as of a real car, measurements take its place."""
     truncated: bool
-    """A log ends without its end mark, or that of the training drive cannot be read."""
+    """A log ends without its end mark, or that of a training drive cannot be read."""
     training: "TrainingRecord | None"
     """The training drive; None where weights were given, or it cannot be read."""
+    practice: "TrainingRecord | None"
+    """The controller's own laps after it; None where there are none, or they cannot be read."""
     refused: int
     """Messages of the log that could not be decoded."""
     started_ns: int | None
@@ -237,10 +240,12 @@ def read_recording(run_dir: Path, log: LogColumns | None = None) -> Recording:
     log = (log or LogColumns(run_dir / "run.mcap", RUN_COLUMNS)).read()
     firsts = [log[topic]["wall_ns"][:1] for topic in RUN_COLUMNS]
     runs, truth = _planned(log)
-    training, whole = _read_training(run_dir, settings)
+    training, whole = _read_training(run_dir, settings, "collect.mcap", "train")
+    practice, practice_whole = _read_training(run_dir, settings, "practice.mcap", "practice")
     return Recording(
         directory=run_dir, settings=settings, track=track, line=line, runs=runs, truth=truth,
-        training=training, truncated=log.reader.truncated or not whole,
+        training=training, practice=practice,
+        truncated=log.reader.truncated or not (whole and practice_whole),
         refused=log.reader.refused, started_ns=min(map(int, np.concatenate(firsts)), default=None),
     )  # fmt: skip
 
@@ -252,19 +257,22 @@ def _driven_on(run_dir: Path, setting: str, label: str) -> tuple[Track, RaceLine
     return track, read_raceline(run_dir / f"{label}_raceline.csv", name)
 
 
-def _read_training(run_dir: Path, settings: RunSettings) -> tuple[TrainingRecord | None, bool]:
-    """The training drive, if there was one, and whether its log is whole.
+def _read_training(
+    run_dir: Path, settings: RunSettings, name: str, label: str
+) -> tuple[TrainingRecord | None, bool]:
+    """A training drive, if there was one, and whether its log ``name`` is whole; ``label``: of its
+    track and line.
 
     The race does not need it: where it cannot be read, it is left out.
     """
-    path = run_dir / "collect.mcap"
+    path = run_dir / name
     if not path.is_file():
         return None, True
     try:
         log = LogColumns(path, RUN_COLUMNS).read()
-        track, line = _driven_on(run_dir, settings.train_track, "train")
+        track, line = _driven_on(run_dir, settings.train_track, label)
     except InputError as error:
-        _log.warning("the training drive is left out: %s", error)
+        _log.warning("a training drive is left out: %s", error)
         return None, False
     runs, _ = _planned(log)
     if not runs:

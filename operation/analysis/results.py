@@ -146,6 +146,11 @@ class RaceResult(_Frozen):
         None,
         description="the last training drive on its own track, all of its samples; null without",
     )
+    practice: LapResult | None = Field(
+        None,
+        description="the controller's own laps of the training track before it raced, all of their "
+        "samples; null without",
+    )
     gp: dict[str, GpMetrics] = Field(
         description="output (vx, vy, omega) to metrics of the first weights on the BestCase run; "
         "empty without these weights or without that run"

@@ -139,18 +139,22 @@ def _uncertain(analysis: RaceAnalysis) -> list[tuple[str, int, int]]:
 def _figures(analysis: RaceAnalysis) -> Iterator[tuple[str, list[Figure]]]:
     """The figures of each section of the page."""
     runs = [run for run in analysis.runs if len(run.record.truth) > 1]
-    settings, track, line = analysis.recording.settings, analysis.track, analysis.line
+    recording, track, line = analysis.recording, analysis.track, analysis.line
     yield "laps", lap_maps(runs, track, line)
     if runs:
         yield "time", time_figures(runs, track)
         friction = analysis.result.settings.friction
-        yield from lap_figures(runs, track, line, settings.car, friction).items()
+        yield from lap_figures(runs, track, line, recording.settings.car, friction).items()
     data = analysis.best_case
     if data is not None and analysis.validations:
         progress = track.project_path(data.x[:, :2]).progress_m
         yield "gp", gp_figures(analysis.validations, progress, track.length_m)
-    if (found := analysis.recording.training) is not None and analysis.training is not None:
-        yield "training", lap_maps([analysis.training], found.track, found.line)
+    if analysis.training is not None:
+        driven = (analysis.training, recording.training), (analysis.practice, recording.practice)
+        yield "training", [
+            figure for run, on in driven if run and on
+            for figure in lap_maps([run], on.track, on.line)
+        ]  # fmt: skip
     if any(len(run.record.telemetry) for run in runs):
         yield "solve", [solve_figure(runs, _period_us(analysis))]
 

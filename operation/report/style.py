@@ -62,6 +62,7 @@ _LOOKS: Final[Mapping[str, Look]] = {
         "BayesRace at the limit", "#E69F00", "maximises progress, GPs updated after each run"
     ),
     "bestcase": Look("BestCase", "#3d3d3a", "the true model, for comparison"),
+    "practice": Look("Practice", "#56B4E9", "BayesRace on the training track, learned from"),
     "pure-pursuit": Look("Pure pursuit", "#CC79A7", "controller of the training laps"),
 }
 

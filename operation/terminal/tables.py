@@ -167,10 +167,11 @@ def print_table(result: RaceResult, console: Console) -> None:
     for lap in result.laps:
         if facts := _facts(lap):
             console.print(Text(f"{lap.name}: {', '.join(facts)}"))
-    if (training := result.training) is not None:
-        style = "yellow" if training.off_track_samples else ""
-        text = f"training drive on {summary.train_track}: {drive_text(training)}"
-        console.print(Text(text, style=style))
+    for what, drive in ("training drive", result.training), ("practice", result.practice):
+        if drive is not None:
+            style = "yellow" if drive.off_track_samples else ""
+            text = f"{what} on {summary.train_track}: {drive_text(drive)}"
+            console.print(Text(text, style=style))
     _print_notes(result, console)
 
 

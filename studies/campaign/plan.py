@@ -38,7 +38,9 @@ from bayesrace.vehicles import CarParameters, get_car
 __all__ = ["Campaign", "read_plan"]
 
 _MOST_CASES: Final = 1_000_000
-_TRAINING: Final = ("train_track", "seed", "collect_s", "points", "kernels", "widen", "pursuit")
+_TRAINING: Final = (
+    "train_track", "seed", "collect_s", "practice_laps", "points", "kernels", "widen", "pursuit",
+)  # fmt: skip
 
 
 _Drawn = Callable[[np.random.Generator], Any]  # a value by random numbers
