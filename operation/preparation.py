@@ -241,7 +241,7 @@ def _practice(
                 settings.delay_s,
             )  # fmt: skip
 
-    by = artefact.name, learned.version, f"{settings.practised_laps}"
+    by = read_manifest(artefact).library_sha256, learned.version, f"{settings.practised_laps}"
     return _kept_drive("practice", on, car, settings, make, *by)
 
 
