@@ -14,7 +14,6 @@ What is missing is driven in practice: laps of the same track, on its racing lin
 with what it has learned so far.
 """
 
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Final
@@ -104,7 +103,7 @@ def collect(
     def pursuit() -> PurePursuit:
         return PurePursuit(car, followed.x_m, followed.y_m, speeds, settings, room_m=room_m)
 
-    watch = _until_it_fails(track, car) if sensors.root else _to_its_end
+    watch = _until_it_fails(track, car) if sensors.root else lambda _: None
     least_s = min(duration_s, _lap_length_s(car, line))
     slowed, driven, log = np.ones(len(speeds)), list[Driven](), None
     try:
@@ -143,10 +142,10 @@ def practise(
     path: Path,
     laps: int,
     seed: int,
-    start_speed_mps: float = 0.1,
-    vehicle: Vehicle | None = None,
-    sensors: Sensors = EXACT,
-    delay_s: float = 0.0,
+    start_speed_mps: float,
+    vehicle: Vehicle,
+    sensors: Sensors,
+    delay_s: float,
 ) -> Driven:
     """Drives laps of a training track with the controller, logged at ``path``, up to where the car
     leaves the track or spins.
@@ -154,7 +153,7 @@ def practise(
     ``vehicle``, ``sensors``, ``seed``, ``delay_s``: as in :class:`ClosedLoop`. Raises FmuFault if
     what simulates the car fails.
     """
-    log = LogWriter(path, {"practice": {"track": track.name, "car": car_text(car)}})
+    log = LogWriter(path, {"collect": {"track": track.name, "car": car_text(car)}})
     try:
         loop = ClosedLoop(
             car, track, line, controller, vehicle, log,
@@ -172,10 +171,6 @@ def practise(
 def _until_it_fails(track: Track, car: CarParameters) -> Watch:
     """Ends a drive where the true car leaves the track or spins."""
     return lambda x: _FAILED if _failing(track, car, np.array([x]))[0] else None
-
-
-def _to_its_end(_: Sequence[float]) -> None:
-    """Ends no drive."""
 
 
 def _slower_after(one: Driven, line: RaceLine, slowed: Floats) -> tuple[Floats, float]:

@@ -4,6 +4,7 @@ Each depends on settings, files and code alone, is kept in the cache under a dig
 and is made only if it is not there. ``race``, ``bench`` and ``latency`` prepare by :func:`prepare`.
 """
 
+import logging
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass, replace
@@ -62,6 +63,8 @@ SOURCES: Final = (
 )  # fmt: skip
 """Our code that shapes a training drive and what is learned from it."""
 
+_log = logging.getLogger(__name__)
+
 _SHAPES_A_DRIVE: Final = {
     "pursuit", "seed", "delay_s", "start_speed_mps", "true_grip", "simulator",
 }  # fmt: skip
@@ -89,14 +92,11 @@ class PreparedTrack:
 
 @dataclass(frozen=True, eq=False)
 class Training:
-    """The training drives, or the practice, and what can be learned from them."""
+    """Drives, and what can be learned from them."""
 
     driven_on: PreparedTrack
     log: Path
     samples: Dataset
-    """Of the drives and of the practice."""
-    practice: "Training | None" = None
-    """The controller's own laps after the training drives, if it has practised."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,7 +106,9 @@ class Prepared:
     tracks: tuple[PreparedTrack, ...]
     """In the order of the tracks."""
     training: Training | None
-    """None where weights were given."""
+    """By pure pursuit; None where weights were given."""
+    practice: Training | None
+    """The controller's own laps of the training track; None without."""
     weights: Path
     artefacts: tuple[Path, ...]
     """In the order of the models."""
@@ -115,6 +117,11 @@ class Prepared:
     def first(self) -> PreparedTrack:
         """The first track."""
         return self.tracks[0]
+
+    @property
+    def samples(self) -> list[Dataset]:
+        """What the weights were learned from; nothing where they were given."""
+        return [one.samples for one in (self.training, self.practice) if one is not None]
 
     @property
     def arguments(self) -> list[str]:
@@ -138,7 +145,7 @@ def prepare(
     made or taken from the cache, but for the files that are given.
 
     Raises InputError for a track, car or line that cannot be used, RaceLineError, CompileError, and
-    FmuFault if the FMU fails in the training drive.
+    FmuFault if the FMU fails in a training drive.
     """
     if artefact is None:  # what is missing is reported now, not after the training
         code_folder()
@@ -152,11 +159,13 @@ def prepare(
     for track in driven_on:
         with stages.stage(f"racing line, {track.name}"):
             prepared_tracks.append(_prepared_track(track, car, settings.raceline, raceline))
-    training = None
+    training = practice = None
     if weights is None:
         train_track = load_track(settings.train_track, car.width_m)
         with stages.stage(f"training line, {train_track.name}"):
             training_track = _training_track(train_track, car, settings.raceline)
+            if settings.practice_laps:
+                practised_on = _prepared_track(train_track, car, settings.raceline)
     artefacts = [] if artefact is None else [artefact]
     if artefact is None:
         with stages.stage("build the controllers"):
@@ -167,15 +176,14 @@ def prepare(
         with stages.stage("train the residual") as stage:
             learned = training.samples, settings.discretisation, training_settings(settings)
             weights = trained_weights(*learned, progress=stage.update)
-        if settings.practised_laps:
+        if settings.practice_laps:
             with stages.stage(f"practice, {train_track.name}"):
-                on = _prepared_track(train_track, car, settings.raceline)
-                practice = _practice(on, car, settings, artefacts[0], weights)
+                practice = _practice(practised_on, car, settings, artefacts[0], weights)
+        if practice is not None:
             with stages.stage("train the residual with practice") as stage:
                 samples = [training.samples, practice.samples]
                 weights = updated_weights(samples, settings, weights, stage.update)
-            training = replace(training, samples=concatenate(samples), practice=practice)
-    return Prepared(tuple(prepared_tracks), training, weights, tuple(artefacts))
+    return Prepared(tuple(prepared_tracks), training, practice, weights, tuple(artefacts))
 
 
 def _prepared_track(
@@ -228,21 +236,25 @@ def _practice(
     settings: PreparationSettings,
     artefact: Path,
     weights: Path,
-) -> Training:
-    """The controller's own laps, from the cache if they are there."""
-    learned = read_weights(weights)
+) -> Training | None:
+    """The controller's own laps, from the cache if they are there; None, with a warning, where
+    they say nothing."""
+    learned, laps = read_weights(weights), settings.practice_laps or 0
 
     def make(partial: Path) -> None:
         controller = compiled_controller(artefact, car, on.track, on.line, learned)
         with _vehicle(settings) as vehicle:
             practise(
-                on.track, on.line, car, controller, partial, settings.practised_laps,
-                settings.seed, settings.start_speed_mps, vehicle, settings.instruments,
-                settings.delay_s,
+                on.track, on.line, car, controller, partial, laps, settings.seed,
+                settings.start_speed_mps, vehicle, settings.instruments, settings.delay_s,
             )  # fmt: skip
 
-    by = read_manifest(artefact).library_sha256, learned.version, f"{settings.practised_laps}"
-    return _kept_drive("practice", on, car, settings, make, *by)
+    by = read_manifest(artefact).library_sha256, learned.version, f"{laps}"
+    try:
+        return _kept_drive("practice", on, car, settings, make, *by)
+    except InputError as error:
+        _log.warning("the practice on %s is left out: %s", on.track.name, error)
+        return None
 
 
 def _kept_drive(

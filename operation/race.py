@@ -1,4 +1,4 @@
-"""The whole chain: racing lines, training drive, GP, controllers, and the laps of the paper.
+"""The whole chain: racing lines, training drives, GP, controllers, and the laps of the paper.
 
 Plant and controller are processes of their own, started as a person would start them; this one
 directs, records every message on the network, and hands over weights.
@@ -164,9 +164,9 @@ def _prepared(settings: RaceSettings, out: Path, stages: Stages) -> Prepared:
     if prepared.training is not None:
         _kept(prepared.training.driven_on, out, "train")
         shutil.copyfile(prepared.training.log, out / "collect.mcap")
-        if (practice := prepared.training.practice) is not None:
-            _kept(practice.driven_on, out, "practice")
-            shutil.copyfile(practice.log, out / "practice.mcap")
+    if prepared.practice is not None:
+        _kept(prepared.practice.driven_on, out, "practice")
+        shutil.copyfile(prepared.practice.log, out / "practice.mcap")
     for model, folder in zip(models, prepared.artefacts, strict=True):
         shutil.copyfile(folder / MANIFEST, out / f"manifest-{model}.json")
     weights = Path(shutil.copyfile(prepared.weights, out / "weights-bayesrace.bin"))
@@ -250,9 +250,7 @@ class Drives:
     ) -> None:
         self._settings, self._out, self._stages = settings, out, stages
         self._prepared, self._system, self._recorder = prepared, system, recorder
-        self._learned_from: list[Dataset] = []
-        if prepared.training is not None:
-            self._learned_from.append(prepared.training.samples)
+        self._learned_from = prepared.samples
         self._run = 0
         self.log = LogColumns(out / _LOG, RUN_COLUMNS)
 

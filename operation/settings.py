@@ -43,7 +43,7 @@ class PreparationSettings(CarSimulation):
         0,
         ge=0,
         le=2**32 - 1,
-        description="seed of the training drive, the GP's starts and the sensors' errors",
+        description="seed of the training drives, the GP's starts and the sensors' errors",
     )
     start_speed_mps: float = Field(0.1, ge=0, le=5, description="speed at the start line")
     collect_s: Annotated[float | None, Option("--train-time")] = Field(
@@ -56,8 +56,9 @@ class PreparationSettings(CarSimulation):
         None,
         ge=0,
         le=100,
-        description="laps of the training track by the controller itself, which it learns from "
-        "before it races; None: 3 where states are estimated, none where they are measured",
+        description="laps of the training track by the controller itself, with its default "
+        "settings, which it learns from before it races; None: 3 where states are estimated, none "
+        "where they are measured",
     )
     points: int = Field(400, ge=20, le=1024, description="training points per output")
     kernels: tuple[Kernel, ...] = Field(
@@ -67,7 +68,8 @@ class PreparationSettings(CarSimulation):
         WIDEN,
         ge=1,
         le=100,
-        description="factor on the standard deviations of first weights, where states are measured",
+        description="factor on the standard deviations of first weights, where states are measured "
+        "and there is no practice",
     )
     threads: int = Field(
         0, ge=0, description="of the training, which they do not change; 0: one per core"
@@ -88,14 +90,10 @@ class PreparationSettings(CarSimulation):
     def _of_the_car(self) -> Self:
         """What is not stated and the car knows."""
         object.__setattr__(self, "train_track", self.train_track or self.car.train_track)
-        return self
-
-    @property
-    def practised_laps(self) -> int:
-        """Laps of the training track by the controller itself."""
         if self.practice_laps is None:
-            return _PRACTICE_LAPS if self.instruments.root else 0
-        return self.practice_laps
+            laps = _PRACTICE_LAPS if self.instruments.root else 0
+            object.__setattr__(self, "practice_laps", laps)
+        return self
 
     @property
     def driven_car(self) -> CarParameters:

@@ -12,11 +12,13 @@ from rich.console import Console
 
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import GpWeights, read_weights
-from bayesrace.learning.dataset import Dataset
+from bayesrace.learning.dataset import Dataset, concatenate
 from bayesrace.manifest import LIBRARY
+from bayesrace.operation.closed_loop import Watch
 from bayesrace.operation.preparation import Prepared, prepare
 from bayesrace.operation.settings import PreparationSettings
 from bayesrace.operation.terminal.terminal import stages_on
+from bayesrace.plant.car import End
 from bayesrace.raceline import RaceLineSettings
 from bayesrace.sensors import get_sensors
 from bayesrace.tracks import Track
@@ -140,32 +142,63 @@ def test_the_controller_learns_from_its_own_laps_of_the_training_track(
 
     monkeypatch.setattr("bayesrace.learning.training.train", train)
     prepared, _ = preparing(practice_laps=1)
-    training = prepared.training
+    training, practice = prepared.training, prepared.practice
     assert training is not None
-    assert training.practice is not None
+    assert practice is not None
     (driven, none), (samples, begun_with) = learned
     assert none is None
     assert begun_with is not None
     assert begun_with.version == "round 1"
-    assert samples.digest() == training.samples.digest()
-    assert len(training.practice.samples) > 50
-    assert len(samples) == len(driven) + len(training.practice.samples)
+    assert driven.digest() == training.samples.digest()
+    assert samples.digest() == concatenate([driven, practice.samples]).digest()
+    assert len(practice.samples) > 50
     assert read_weights(prepared.weights).version == "round 2"
     again, stages = preparing(practice_laps=1)
     assert "practice, random" in stages
     assert again.weights == prepared.weights
     assert len(learned) == 2
     without, _ = preparing(practice_laps=0)
+    assert without.practice is None
     assert without.training is not None
-    assert without.training.practice is None
     assert without.training.log == training.log
 
 
+def test_practice_is_kept_for_all_that_shapes_it(
+    preparing: Preparing, weights: GpWeights, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    logs = set()
+
+    def practise(**changes: object) -> None:
+        prepared, _ = preparing(**{"practice_laps": 1} | changes)
+        assert prepared.practice is not None
+        logs.add(prepared.practice.log)
+
+    for changes in ({}, {"practice_laps": 2}, {"start_speed_mps": 0.2}):
+        practise(**changes)
+    others = replace(weights, version="others")
+    monkeypatch.setattr("bayesrace.learning.training.train", lambda *_: others)
+    practise(collect_s=2.5)
+    assert len(logs) == 4
+
+
+def test_practice_that_says_nothing_is_left_out(
+    preparing: Preparing, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def at_once(*_: object) -> Watch:
+        return lambda _: End("stopped", "spins")
+
+    monkeypatch.setattr("bayesrace.operation.collect._until_it_fails", at_once)
+    prepared, _ = preparing(practice_laps=1)
+    assert prepared.practice is None
+    assert prepared.training is not None
+    assert prepared.samples == [prepared.training.samples]
+    assert "the practice on random:2 is left out: no two states follow one another" in caplog.text
+
+
 def test_there_is_practice_where_states_are_estimated() -> None:
-    assert PreparationSettings().practised_laps == 0
-    estimated = PreparationSettings(sensors=get_sensors("mocap"))
-    assert estimated.practised_laps == 3
-    assert estimated.model_copy(update={"practice_laps": 0}).practised_laps == 0
+    assert PreparationSettings().practice_laps == 0
+    assert PreparationSettings(sensors=get_sensors("mocap")).practice_laps == 3
+    assert PreparationSettings(sensors=get_sensors("mocap"), practice_laps=0).practice_laps == 0
 
 
 def test_a_track_without_the_room_is_trained_on_with_less(

@@ -299,7 +299,7 @@ def test_report_makes_the_same_again_from_the_log(
 def test_a_run_that_cannot_be_learned_from_is_named_with_its_log(tmp_path: Path) -> None:
     write_race(tmp_path, [Drive("worstcase", circle(np.zeros(1), 1.0))])
     recorder: Any = SimpleNamespace(drain=lambda at_most_s: None)
-    prepared: Any = SimpleNamespace(training=None)
+    prepared: Any = SimpleNamespace(samples=[])
     unused: Any = None
     drives = driving.Drives(RaceSettings(), tmp_path, unused, prepared, unused, recorder)
     for run, reason in ((1, "no two states follow one another"), (2, "the log does not hold it")):

@@ -17,12 +17,14 @@ from bayesrace.arrays import Floats
 from bayesrace.codegen.build import build
 from bayesrace.codegen.settings import BuildSettings
 from bayesrace.controller import pure_pursuit
-from bayesrace.controller.pure_pursuit import DrivingStyle, PurePursuitSettings
+from bayesrace.controller.pure_pursuit import DrivingStyle, PurePursuit, PurePursuitSettings
+from bayesrace.controller.python_controller import PythonController
 from bayesrace.learning.sources import read_samples
 from bayesrace.operation.closed_loop import Driven, built_in_car
 from bayesrace.operation.collect import (
     collect,
     drive_length_s,
+    practise,
     slower_before,
     training_line,
     training_margin_m,
@@ -31,7 +33,7 @@ from bayesrace.operation.report import write_report
 from bayesrace.operation.settings import RaceSettings
 from bayesrace.operation.terminal.tables import print_table
 from bayesrace.raceline import RaceLine, write_raceline
-from bayesrace.sensors import get_sensors
+from bayesrace.sensors import EXACT, get_sensors
 from bayesrace.studies.campaign.case import Case, run_case
 from bayesrace.tracks import Track, load_track, write_track
 from bayesrace.vehicles import get_car
@@ -204,6 +206,26 @@ def test_collect_says_how_the_drive_went(tmp_path: Path, cli: Cli) -> None:
     done = cli("collect", *options, "--style", "calm")
     assert done.code == 0, done.err
     assert "1 drive, 100 samples, 0 of them off the track, up to " in done.out
+
+
+def test_practice_ends_where_the_car_leaves_its_track_and_its_log_is_one_to_learn_from(
+    tmp_path: Path,
+) -> None:
+    """Along a line that leads off the track; the car is not a built-in one."""
+    car = CAR.model_copy(update={"name": "ours"})
+    beside = offset_line(TRACK, float(TRACK.width_left_m.max()) + 0.1, 6.0, 3.0)
+    artefact, log = build(BuildSettings(car=car))[0], tmp_path / "practice.mcap"
+    law = PurePursuit(car, beside.x_m, beside.y_m, beside.vx_mps, PurePursuitSettings())
+    controller = PythonController(artefact, law)
+    given = 3, 0, 0.1, built_in_car(car), EXACT, 0.0
+    driven = practise(TRACK, at_the_edge(), car, controller, log, *given)
+    off_m = driven.track.project_path(driven.x[:, :2]).off_track_m
+    assert driven.end.text == "the car has left its track, or spins"
+    assert (off_m[:-1] <= 0).all()
+    assert off_m[-1] > 0
+    learned = read_samples([log]).dataset
+    assert learned.car == car
+    assert learned.digest() == driven.samples().digest()
 
 
 def test_a_race_reports_its_training_drive(

@@ -261,12 +261,13 @@ class RaceAnalysis:
         metrics = {who: gp_metrics(one.metrics) for who, one in self.validations.items()}
         recording = self.recording
         limit_s = _limits_in(recording.directory)
+        practised = recording.settings.practice_laps or 0
         return RaceResult(
             settings=_summary(recording),
             laps=[run.result(recording.settings.laps, limit_s) for run in self.runs],
             limit_s=limit_s,
             training=None if self.training is None else self.training.result(),
-            practice=None if self.practice is None else self.practice.result(),
+            practice=None if self.practice is None else self.practice.result(practised),
             gp=metrics.get("bayesrace", {}),
             gp_updated=metrics.get("bayesrace-updated", {}),
             real_time_factor=_real_time_factor(recording.runs),

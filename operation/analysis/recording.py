@@ -192,6 +192,7 @@ class RunSettings(BaseModel):
     mode: str = ""
     seed: int = 0
     laps: int = 0
+    practice_laps: int | None = None
     discretisation: Discretisation = PREDICTION
     mpc: _Mpc = _Mpc()
     fmu: str | None = None

@@ -149,12 +149,13 @@ def _figures(analysis: RaceAnalysis) -> Iterator[tuple[str, list[Figure]]]:
     if data is not None and analysis.validations:
         progress = track.project_path(data.x[:, :2]).progress_m
         yield "gp", gp_figures(analysis.validations, progress, track.length_m)
-    if analysis.training is not None:
-        driven = (analysis.training, recording.training), (analysis.practice, recording.practice)
-        yield "training", [
-            figure for run, on in driven if run and on
-            for figure in lap_maps([run], on.track, on.line)
-        ]  # fmt: skip
+    driven = (analysis.training, recording.training), (analysis.practice, recording.practice)
+    maps = [
+        figure for run, on in driven if run and on
+        for figure in lap_maps([run], on.track, on.line)
+    ]  # fmt: skip
+    if maps:
+        yield "training", maps
     if any(len(run.record.telemetry) for run in runs):
         yield "solve", [solve_figure(runs, _period_us(analysis))]
 

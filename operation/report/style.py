@@ -51,7 +51,7 @@ class Look(NamedTuple):
 # Okabe and Ito's colours, which colour-blind readers can distinguish.
 _LOOKS: Final[Mapping[str, Look]] = {
     "worstcase": Look("WorstCase", "#D55E00", "e-kinematic model, no correction"),
-    "bayesrace": Look("BayesRace", "#0072B2", "corrected by GPs learned from pure pursuit"),
+    "bayesrace": Look("BayesRace", "#0072B2", "corrected by GPs learned before the race"),
     "bayesrace-updated": Look(
         "BayesRace updated", "#009E73", "GPs updated with BayesRace's own laps"
     ),

@@ -206,9 +206,10 @@ def drive_text(drive: LapResult) -> str:
         off += f" by up to {_metres(drive.off_track_max_m)} m"
     faster = drive.run - 1
     before = f"after {faster} faster {'drives' if faster > 1 else 'drive'}, " if faster else ""
+    end = "" if drive.passed else f"; {drive.ended}"
     return (
         f"{before}{f'laps {laps} s' if laps else 'no lap'}, {off}, "
-        f"up to {_decimals(drive.speed_max_mps, 2)} m/s and {_slip(drive)}° of slip"
+        f"up to {_decimals(drive.speed_max_mps, 2)} m/s and {_slip(drive)}° of slip{end}"
     )
 
 

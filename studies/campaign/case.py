@@ -49,7 +49,7 @@ LEARNS_FROM: Final[Mapping[Controller, tuple[Controller, ...]]] = {
     "bayesrace-updated-twice": ("bayesrace", "bayesrace-updated"),
     "bayesrace-limit": ("bayesrace",),
 }
-"""Whose laps a controller's weights are learned from beside the training drive. Training begins
+"""Whose laps a controller's weights are learned from beside the training drives. Training begins
 with the weights of the last one named."""
 
 _FIXED: Final = {
@@ -258,7 +258,7 @@ class _Runs:
         return _prepared(settings, self._settings.track, models, self._case.weights)
 
     def _weights(self, controller: Controller) -> Path:
-        """Those of the training drive, or learned from the laps of others, too."""
+        """Those of the training drives, or learned from the laps of others, too."""
         if controller not in LEARNS_FROM:
             return self._files.weights
         sources = LEARNS_FROM[controller]
@@ -268,12 +268,12 @@ class _Runs:
         return self._updates[sources]
 
     def _samples_of(self, controllers: tuple[Controller, ...]) -> list[Dataset]:
-        """Those of the training drive, and of the laps of these controllers."""
+        """Those of the training drives, and of the laps of these controllers."""
         missing = [one for one in controllers if one not in self._runs]
-        if missing or (training := self._files.training) is None:
+        if missing or not self._files.samples:
             who = ", ".join(missing) or "the training drive"
             raise RuntimeError(f"there are no laps of {who} to learn from")
-        return [training.samples, *(self._runs[one].samples() for one in controllers)]
+        return [*self._files.samples, *(self._runs[one].samples() for one in controllers)]
 
     def _learned(self, samples: list[Dataset], before: Path) -> Path:
         return preparation.updated_weights(samples, self._settings, before)
