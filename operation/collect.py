@@ -111,7 +111,7 @@ def collect(
             if log is None or not sensors.root:
                 if log is not None:
                     log.close()
-                log = LogWriter(path, {"collect": {"track": track.name, "car": car_text(car)}})
+                log = _log_of(path, track, car)
                 controller, driven = PythonController(artefact, pursuit()), []
                 loop = ClosedLoop(
                     car, track, line, controller, vehicle, log,
@@ -153,7 +153,7 @@ def practise(
     ``vehicle``, ``sensors``, ``seed``, ``delay_s``: as in :class:`ClosedLoop`. Raises FmuFault if
     what simulates the car fails.
     """
-    log = LogWriter(path, {"collect": {"track": track.name, "car": car_text(car)}})
+    log = _log_of(path, track, car)
     try:
         loop = ClosedLoop(
             car, track, line, controller, vehicle, log,
@@ -166,6 +166,11 @@ def practise(
     if driven.end.reason == "plant_fault":
         raise FmuFault(driven.end.text)
     return driven
+
+
+def _log_of(path: Path, track: Track, car: CarParameters) -> LogWriter:
+    """Names the car, so that what is learned from the log is learned of this one."""
+    return LogWriter(path, {"collect": {"track": track.name, "car": car_text(car)}})
 
 
 def _until_it_fails(track: Track, car: CarParameters) -> Watch:
