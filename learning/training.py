@@ -1,6 +1,7 @@
 """From samples to weights of the mean function: one GP per output of the residual.
 
-1. Add each sample's mirror image, if the car's file says so, and standardise features and targets
+1. Add each sample's mirror image, if the car's file says so and its samples do not contradict
+   (:mod:`bayesrace.learning.symmetry`), and standardise features and targets
    (:mod:`bayesrace.learning.target`). A sample and its image are in the same stretch.
 2. Per output and candidate kernel: hyperparameters by marginal likelihood, on at most
    ``hyper_points`` samples (:mod:`bayesrace.learning.gaussian_process`). Seeded starts, or given
@@ -27,6 +28,7 @@ else.
 """
 
 import hashlib
+import logging
 import multiprocessing
 import os
 import signal
@@ -56,16 +58,20 @@ from bayesrace.gp.weights import (
     read_weights,
 )
 from bayesrace.integrators import Discretisation
+from bayesrace.learning.change import brought_up_to_date
 from bayesrace.learning.dataset import Dataset, concatenate, left_out
 from bayesrace.learning.estimates import learned_in_turns
 from bayesrace.learning.gaussian_process import Fit, PairDistances, maximise, refine, starts
 from bayesrace.learning.settings import MIN_SAMPLES, Progress, TrainingSettings
 from bayesrace.learning.subset import bounded, evenly, most_informative, spans, stretches
+from bayesrace.learning.symmetry import symmetric
 from bayesrace.learning.target import KernelScore, Target
 from bayesrace.learning.validation import identity, residual
 from bayesrace.processes import die_with_parent
 
 __all__ = ["MAX_SAMPLES", "NICE", "Outcome", "Trainer", "Training", "fit", "perform", "train"]
+
+_log = logging.getLogger(__name__)
 
 MAX_SAMPLES: Final = 100_000
 """Choosing among more would take gigabytes."""
@@ -162,7 +168,11 @@ def _fit(
     """One training on these samples; ``widen`` as in the settings."""
     model, errors = identity(dataset, discretisation), residual(dataset, discretisation)
     _check(dataset, errors)
-    samples = dataset.with_mirror_images() if dataset.car.mirrored_samples else dataset
+    samples = dataset
+    if symmetric(dataset, discretisation):
+        samples = dataset.with_mirror_images()
+    elif dataset.car.mirrored_samples:
+        _log.warning("mirror images are left out: the car does not turn left as it turns right")
     images = len(samples) // len(dataset)
     folds = np.repeat(stretches(dataset, settings.folds), images)
     columns = residual(samples, discretisation).T, samples.deviation.T[:3]
@@ -315,6 +325,8 @@ class Outcome:
     weights: GpWeights | None = None
     samples: int = 0
     """Learned from."""
+    moved: int = 0
+    """Of these, from before the car has changed (:mod:`bayesrace.learning.change`)."""
     kept: Dataset | None = None
     """Kept of the samples, also where nothing can be learned from them; None if that failed."""
     training_s: float = 0.0
@@ -334,14 +346,16 @@ def perform(
     """
     begin_s, every = time.monotonic(), concatenate(samples)
     before = None if initial is None else read_weights(initial)
-    weights, error = None, ""
+    weights, error, moved = None, "", 0
     try:
+        if before is not None:
+            every, moved = brought_up_to_date(every, before, discretisation)
         made = fit(every, discretisation, settings, before)
         weights, every = made.weights, made.samples
     except (InputError, ArithmeticError, ValueError) as reason:  # LinAlgError is a ValueError
         error = str(reason) or type(reason).__name__
     kept = bounded(every, keep, weights or before).settled()
-    return Outcome(error, weights, len(every), kept, time.monotonic() - begin_s)
+    return Outcome(error, weights, len(every), moved, kept, time.monotonic() - begin_s)
 
 
 class Trainer:

@@ -21,6 +21,7 @@ from bayesrace.errors import InputError
 from bayesrace.files import read_whole, replacing
 from bayesrace.gp.weights import encode_weights, read_weights, write_weights
 from bayesrace.integrators import Discretisation
+from bayesrace.learning.change import brought_up_to_date
 from bayesrace.learning.dataset import Dataset, concatenate
 from bayesrace.learning.settings import Progress, TrainingSettings
 from bayesrace.learning.sources import CYCLES, STATES, dataset_from_columns
@@ -182,7 +183,7 @@ def prepare(
         if practice is not None:
             with stages.stage("train the residual with practice") as stage:
                 samples = [training.samples, practice.samples]
-                weights = updated_weights(samples, settings, weights, stage.update)
+                weights, _ = updated_weights(samples, settings, weights, stage.update)
     return Prepared(tuple(prepared_tracks), training, practice, weights, tuple(artefacts))
 
 
@@ -369,10 +370,20 @@ def updated_weights(
     settings: PreparationSettings,
     first: Path,
     progress: Progress | None = None,
-) -> Path:
-    """File of the weights learned from all samples, beginning with ``first``."""
-    learned = training_settings(settings)
-    return trained_weights(concatenate(samples), settings.discretisation, learned, first, progress)
+) -> tuple[Path, Dataset]:
+    """File of the weights learned from all samples, beginning with ``first``; and the samples, as
+    the car would do them now if it has changed since ``first`` was learned.
+
+    ``samples``: in the order in which they were driven.
+    """
+    every, model = concatenate(samples), settings.discretisation
+    every, moved = brought_up_to_date(every, read_weights(first), model)
+    if moved:
+        _log.warning(
+            "the car is another one since sample %d of %d: the samples before were moved by what "
+            "is new, and count for less", moved + 1, len(every),
+        )  # fmt: skip
+    return trained_weights(every, model, training_settings(settings), first, progress), every
 
 
 def _artefact(settings: PreparationSettings, model: PredictionModel) -> Path:

@@ -338,5 +338,8 @@ class Drives:
         """Weights learned from a run and all samples before it, beginning with ``weights``."""
         self._learned_from.append(self.samples(driven))
         with self._stages.stage(f"update the residual{number}") as stage:
-            learned = updated_weights(self._learned_from, self._settings, weights, stage.update)
+            learned, samples = updated_weights(
+                self._learned_from, self._settings, weights, stage.update
+            )
+            self._learned_from = [samples]
             return Path(shutil.copyfile(learned, self._out / name))

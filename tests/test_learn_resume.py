@@ -88,7 +88,7 @@ class FakeTrainer:
             return Outcome("killed")
         samples = concatenate(self._jobs.tasks[-1].args[1])
         weights = zero_weights(CAR.name, NAME, f"v{len(self._jobs.tasks)}")
-        return Outcome("", weights, len(samples), samples)
+        return Outcome("", weights, len(samples), kept=samples)
 
 
 class Jobs:

@@ -31,7 +31,7 @@ def test_with_a_model_that_is_right_the_laps_stay_on_the_track() -> None:
 
     laps = driven(nominal, prepared.weights).samples()
     samples = [prepared.training.samples, laps]
-    updated = driven(nominal, updated_weights(samples, settings, prepared.weights))
+    updated = driven(nominal, updated_weights(samples, settings, prepared.weights)[0])
     perfect = driven(true)
     assert updated.off_track_m.max() <= 0
     assert perfect.off_track_m.max() <= 0

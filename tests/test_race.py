@@ -19,6 +19,7 @@ from bayesrace.codegen.build import build
 from bayesrace.codegen.settings import BuildSettings
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import read_weights, write_weights
+from bayesrace.learning.dataset import Dataset
 from bayesrace.operation import race as driving
 from bayesrace.operation.analysis.results import RaceResult, read_result
 from bayesrace.operation.drive import RunPlan
@@ -187,8 +188,9 @@ def test_a_refusal_is_a_row_and_the_race_goes_on(
 ) -> None:
     """The update, or the first training, too, has learned something absurd."""
 
-    def learn(*arguments: Any) -> Path:
-        return absurd(updated_weights(*arguments), tmp_path / "updated.bin")
+    def learn(*arguments: Any) -> tuple[Path, Dataset]:
+        weights, samples = updated_weights(*arguments)
+        return absurd(weights, tmp_path / "updated.bin"), samples
 
     def prepared(*arguments: Any) -> Prepared:
         found = prepare(*arguments)

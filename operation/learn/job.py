@@ -200,6 +200,7 @@ class Learner:
         update = UpdateRecord(
             after_lap=self._after_lap,
             samples=outcome.samples,
+            moved=outcome.moved,
             training_s=round(outcome.training_s, 3),
             verdict="failed" if failed else "pending",
             answer=outcome.error,
@@ -210,6 +211,11 @@ class Learner:
         if failed:
             self._say(f"nothing learned after lap {update.after_lap}: {update.answer}")
             return
+        if update.moved:
+            self._say(
+                f"the car is another one since sample {update.moved + 1} of {update.samples}: the "
+                "samples before were moved by what is new, and count for less"
+            )
         self._say(
             f"learned after lap {update.after_lap}: {update.version}, {update.points} points of "
             f"{update.samples} samples in {update.training_s:.1f} s, {update.kept} kept"

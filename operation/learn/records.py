@@ -59,6 +59,7 @@ class UpdateRecord(BaseModel):
     version: str = Field("", description="of its weights; empty if there are none")
     file: str = Field("", description="of the weights; old ones are deleted")
     samples: int = Field(0, description="learned from")
+    moved: int = Field(0, description="of these, from before the car has changed")
     kept: int = Field(0, description="samples kept for the next training")
     points: int = Field(0, description="training points per output, the most")
     training_s: float = 0.0

@@ -223,20 +223,20 @@ class _Runs:
     def __init__(self, case: Case) -> None:
         self._case, self._settings = case, case.settings
         self._runs: dict[Controller, Driven] = {}
-        self._updates: dict[tuple[Controller, ...], Path] = {}
-        """Weights that are learned from laps, by whose."""
+        self._updates: dict[tuple[Controller, ...], tuple[Path, list[Dataset]]] = {}
+        """Weights that are learned from laps, and the samples, by whose."""
 
     def drive(self, controller: Controller) -> list[Row]:
         """The rows of the controller's laps; of ``bayesrace-limit``, those of its last run."""
         learned = controller == "bayesrace" or controller in LEARNS_FROM
-        weights = self._weights(controller) if learned else None
+        weights, samples = self._learned(controller) if learned else (None, [])
         begun = time.perf_counter()
         driven = self._runs[controller] = self._driven(controller, weights)
         if controller == "bayesrace-limit" and weights is not None:
-            samples = self._samples_of(LEARNS_FROM[controller])
             for _ in range(self._settings.progress_runs - 1):
-                samples.append(driven.samples())
-                weights = self._learned(samples, weights)
+                samples = [*samples, driven.samples()]
+                weights, every = preparation.updated_weights(samples, self._settings, weights)
+                samples = [every]
                 driven = self._driven(controller, weights)
         run = {
             "controller": controller, "weights": driven.weights_version,
@@ -257,26 +257,20 @@ class _Runs:
         settings = PreparationSettings.model_validate(wanted)
         return _prepared(settings, self._settings.track, models, self._case.weights)
 
-    def _weights(self, controller: Controller) -> Path:
-        """Those of the training drives, or learned from the laps of others, too."""
+    def _learned(self, controller: Controller) -> tuple[Path, list[Dataset]]:
+        """Weights of the training drives, or learned from laps of others, too; their samples."""
         if controller not in LEARNS_FROM:
-            return self._files.weights
+            return self._files.weights, self._files.samples
         sources = LEARNS_FROM[controller]
         if sources not in self._updates:
-            samples, before = self._samples_of(sources), self._weights(sources[-1])
-            self._updates[sources] = self._learned(samples, before)
+            before, samples = self._learned(sources[-1])
+            if sources[-1] not in self._runs or not samples:
+                who = sources[-1] if samples else "the training drive"
+                raise RuntimeError(f"there are no laps of {who} to learn from")
+            samples = [*samples, self._runs[sources[-1]].samples()]
+            weights, every = preparation.updated_weights(samples, self._settings, before)
+            self._updates[sources] = weights, [every]
         return self._updates[sources]
-
-    def _samples_of(self, controllers: tuple[Controller, ...]) -> list[Dataset]:
-        """Those of the training drives, and of the laps of these controllers."""
-        missing = [one for one in controllers if one not in self._runs]
-        if missing or not self._files.samples:
-            who = ", ".join(missing) or "the training drive"
-            raise RuntimeError(f"there are no laps of {who} to learn from")
-        return [*self._files.samples, *(self._runs[one].samples() for one in controllers)]
-
-    def _learned(self, samples: list[Dataset], before: Path) -> Path:
-        return preparation.updated_weights(samples, self._settings, before)
 
     def _driven(self, controller: Controller, weights: Path | None) -> Driven:
         settings, best = self._settings, controller == "bestcase"

@@ -128,7 +128,7 @@ class Experiment:
     def updated(self, lap: DrivenRun) -> Path:
         """Learned from training drive and lap, beginning with the weights before."""
         samples = [self.training, self.samples(lap)]
-        return updated_weights(samples, self.settings, self.weights)
+        return updated_weights(samples, self.settings, self.weights)[0]
 
 
 def stored(name: str, parts: Iterable[str], make: Callable[[], Any]) -> Any:

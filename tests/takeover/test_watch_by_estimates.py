@@ -40,7 +40,7 @@ def updated() -> GpWeights:
     files = prepared()
     assert files.training is not None
     samples = [files.training.samples, racing().driven.samples()]
-    return read_weights(updated_weights(samples, PreparationSettings(), files.weights))
+    return read_weights(updated_weights(samples, PreparationSettings(), files.weights)[0])
 
 
 class Sampled(ClosedLoop):
