@@ -45,6 +45,7 @@ from bayesrace.operation.drive import RunPlan, announcement, run_request
 from bayesrace.plant.car import CarRun, End, drive_lockstep, truth_behind
 from bayesrace.plant.simulator import Simulator
 from bayesrace.plant.vehicle import Vehicle
+from bayesrace.plant.world import UNCHANGED, World
 from bayesrace.raceline import RaceLine
 from bayesrace.realtime import uncollected
 from bayesrace.sensors import EXACT, Sensors
@@ -152,9 +153,9 @@ class Driven(Trajectory):
         return text + (f", {self.fallbacks} fallbacks" if self.fallbacks else "")
 
 
-def built_in_car(car: CarParameters) -> Simulator:
+def built_in_car(car: CarParameters, world: World = UNCHANGED) -> Simulator:
     """The car by the built-in equations, compiled; several loops in turn may drive it."""
-    return Simulator(dynamic(car), compiled=compiled)
+    return Simulator(dynamic(car), compiled=compiled, world=world)
 
 
 class ClosedLoop:

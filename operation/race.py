@@ -43,6 +43,7 @@ from bayesrace.operation.system import Child, System, child, started_system
 from bayesrace.operation.terminal.terminal import Stages
 from bayesrace.plant.simulator import PLANT
 from bayesrace.plant.vehicle import FmuFault, open_vehicle
+from bayesrace.plant.world import write_world
 from bayesrace.recorder import Recorder
 from bayesrace.sensors import write_sensors
 from bayesrace.tracks import load_track
@@ -62,6 +63,7 @@ _LOWEST: Final = 19
 _LOG: Final = "run.mcap"
 _CAR: Final = "car.toml"
 _SENSORS: Final = "sensors.toml"
+_WORLD: Final = "world.toml"
 _FMU_COPIES: Final = {"fmu": "car.fmu", "fmu_map": "car-map.toml"}
 
 
@@ -224,12 +226,15 @@ def _kept(track: PreparedTrack, out: Path, label: str) -> PreparedTrack:
 def _plant_options(settings: RaceSettings, out: Path) -> list[str]:
     """Of ``bayesrace plant``."""
     files = ("--fmu", settings.fmu), ("--map", settings.fmu_map)
-    sensors = out / _SENSORS
+    sensors, changes = out / _SENSORS, settings.changes
+    if changes.root:
+        write_world(out / _WORLD, changes)
     if settings.instruments.root:
         write_sensors(sensors, settings.instruments)
     pairs = [
         ("--car", out / _CAR), ("--simulator", settings.simulator),
         *(pair for pair in files if pair[1]),
+        *([("--world", out / _WORLD)] if changes.root else []),
         ("--sensors", sensors if settings.instruments.root else "exact"),
         ("--delay", 1e3 * settings.delay_s), ("--seed", settings.seed),
     ]  # fmt: skip

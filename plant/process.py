@@ -339,10 +339,10 @@ def main(
     vehicles: AbstractContextManager[Vehicle]
     vehicles = nullcontext(hardware) if hardware else open_vehicle(
         settings.car, settings.fmu, settings.fmu_map, settings.rate_hz, compiled,
-        simulator=settings.simulator,
+        simulator=settings.simulator, world=settings.changes,
     )  # fmt: skip
-    if hardware is not None and settings.delay_s:
-        raise InputError("a real car has delays of its own: leave out delay_s")
+    if hardware is not None and (settings.delay_s or settings.changes.root):
+        raise InputError("a real car has delays and a world of its own: leave out delay_s, world")
     settings.endpoints.check_car(settings.name or settings.car.name)
     with vehicles as vehicle, open_sessions(settings.endpoints, "plant") as sessions:
         process = PlantProcess(sessions.current, settings, vehicle)

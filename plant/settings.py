@@ -6,6 +6,7 @@ from typing import Annotated, Literal, Self
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from bayesrace.defaults import Option
+from bayesrace.plant.world import UNCHANGED, World, WorldSetting
 from bayesrace.sensors import Sensors, SensorsSetting
 from bayesrace.vehicles import CarSetting, default_car
 
@@ -37,6 +38,7 @@ class CarSimulation(BaseModel):
         0.0, ge=0, le=1, description="delay put on states and on actuations each"
     )
     sensors: SensorsSetting = None
+    world: WorldSetting = None
 
     @property
     def states_hz(self) -> float:
@@ -47,6 +49,19 @@ class CarSimulation(BaseModel):
     def instruments(self) -> Sensors:
         """Those chosen, or the car's own."""
         return self.car.sensors if self.sensors is None else self.sensors
+
+    @property
+    def changes(self) -> World:
+        """What changes while the car drives."""
+        return self.world or UNCHANGED
+
+    @model_validator(mode="after")
+    def _can_change(self) -> Self:
+        if self.changes.root:
+            if self.fmu is not None or self.simulator != "equations":
+                raise ValueError("world: only the built-in car can change while it drives")
+            self.changes.check(self.car)
+        return self
 
     @model_validator(mode="after")
     def _readings_fit(self) -> Self:

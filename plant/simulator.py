@@ -8,6 +8,7 @@ from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
 from bayesrace.integrators import PLANT_SCHEME, PLANT_SUBSTEP_HZ, Discretisation
 from bayesrace.plant.vehicle import Command, Compile, Vehicle
+from bayesrace.plant.world import UNCHANGED, World, changed_car
 from bayesrace.vehicles.models import Model
 
 __all__ = ["PLANT", "Simulator", "plant_discretisation"]
@@ -68,24 +69,40 @@ class Simulator(Vehicle):
         model: Model,
         discretisation: Discretisation = PLANT,
         compiled: Compile | None = None,
+        world: World = UNCHANGED,
     ) -> None:
-        """Without ``compiled``, CasADi interprets the equations, which takes five times as long."""
+        """``world``: what changes while the car drives; its commands are guarded as those of the
+        car without.
+
+        Without ``compiled``, CasADi interprets the equations, which takes five times as long."""
         super().__init__(model.car, discretisation.step_s, discretisation.substeps)
         self._u: Floats = np.zeros(len(model.inputs))
         substep = Discretisation(
             scheme=discretisation.scheme, step_s=self.step_s / self.substeps, substeps=1
         )
-        parameters = np.array(model.parameters, dtype=np.float64)
+        self._world, self._shares = world, world.shares(0.0, 0.0, 0.0)
+        self._parameters = np.array(model.parameters, dtype=np.float64)
+        self._change()
         function = substep.for_any_car(model)
         function = compiled(function) if compiled else function
-        self._equations = _Substeps(function, self.x, self._u, parameters)
+        self._equations = _Substeps(function, self.x, self._u, self._parameters)
 
     def _place(self, start: Floats) -> None:
         self.x[:] = start
 
+    def _change(self) -> None:
+        """To the car with the present shares."""
+        if self._world.root:
+            numbers = changed_car(self.car, self._shares).equation_numbers
+            self._parameters[:] = list(numbers.values())
+
     def _hold(self, u: Command, count: int) -> tuple[float, float]:
         """For so many substeps; what acted."""
         x, duration_s = self.x, self.step_s * count / self.substeps
+        shares = self._world.shares(self.time_s, float(x[0]), float(x[1]))
+        if shares != self._shares:
+            self._shares = shares
+            self._change()
         delta = float(x[6])
         applied = self.guard.apply(u, x, duration_s)
         self._u[0], self._u[1] = applied

@@ -21,6 +21,7 @@ from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
 from bayesrace.messages import BrakingPlan, Reading
 from bayesrace.plant.settings import SimulatorName
+from bayesrace.plant.world import UNCHANGED, World
 from bayesrace.vehicles.parameters import CarParameters
 
 if TYPE_CHECKING:
@@ -271,10 +272,11 @@ def open_vehicle(
     compiled: Compile | None = None,
     *,
     simulator: SimulatorName = "equations",
+    world: World = UNCHANGED,
 ) -> Iterator[Vehicle]:
     """The car by the built-in equations, by slipx, or by an FMU and the map of its variables.
 
-    ``compiled``: of the equations, see :class:`bayesrace.plant.simulator.Simulator`.
+    ``compiled``, ``world``: of the equations, see :class:`bayesrace.plant.simulator.Simulator`.
 
     Raises InputError if the FMU, the map, the rate or the car cannot be used.
     """
@@ -289,7 +291,7 @@ def open_vehicle(
         from bayesrace.plant.simulator import Simulator, plant_discretisation
         from bayesrace.vehicles.models import dynamic
 
-        yield Simulator(dynamic(car), plant_discretisation(rate_hz), compiled)
+        yield Simulator(dynamic(car), plant_discretisation(rate_hz), compiled, world)
         return
     if simulator != "equations":
         raise InputError(f"--simulator {simulator} and --fmu {fmu}: only one can be the car")

@@ -250,6 +250,27 @@ def test_each_update_learns_from_all_laps_before_it(
     assert after[0] == first
 
 
+def test_a_campaign_varies_the_world(read: Read, tmp_path: Path) -> None:
+    """By files beside the plan; nothing of it reaches the controller."""
+    (tmp_path / "heavy.toml").write_text("[[world]]\nwhat = 'mass'\nshare = 1.5\n")
+    text = """
+        controllers = ["bestcase"]
+        weights = "weights.bin"
+        [grid]
+        laps = 1
+        track = "peanut.csv"
+        world = ["none", "heavy.toml"]
+    """
+    campaign = read(text)
+    rows = [run_case(one.task(), campaign.files)[0] for one in campaign.cases.values()]
+    labels = [one.columns["world"] for one in campaign.cases.values()]
+    assert labels[0] == ""
+    assert labels[1].startswith("mass (")
+    assert rows[1]["lap_time_s"] > 1.02 * rows[0]["lap_time_s"]
+    with pytest.raises(InputError, match=r"grid\.world"):
+        read(text.replace("heavy.toml", "missing.toml"))
+
+
 def only(campaign: Campaign) -> list[dict[str, Any]]:
     """The rows of the one case."""
     (case,) = campaign.cases.values()

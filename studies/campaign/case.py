@@ -130,6 +130,7 @@ class Case:
             "key": self.key,
             **values | {"car": settings.car.name, "kernels": "+".join(settings.kernels)},
             "sensors": settings.instruments.label,
+            "world": settings.changes.label,
             "car_identity": car_identity(settings.car),
             "settings": settings.model_dump_json(exclude=_LEFT_OUT),
         }
@@ -282,7 +283,8 @@ class _Runs:
         table = _table(*on, car.tuning.path.spacing_m)
         loop = ClosedLoop(
             car, *on, compiled_controller(artefact, car, *on, weights, settings.mpc, table=table),
-            _vehicle(settings.true_car), sensors=EXACT if best else settings.instruments,
+            _vehicle(settings.true_car, settings.changes),
+            sensors=EXACT if best else settings.instruments,
             seed=settings.seed, delay_s=settings.delay_s,
         )  # fmt: skip
         limit_s = settings.limit_s(on[1].lap_time_s)

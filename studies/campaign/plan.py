@@ -21,6 +21,7 @@ from bayesrace.errors import InputError, faults_in
 from bayesrace.files import parse_toml, read_text
 from bayesrace.gp.weights import decode_weights
 from bayesrace.operation.settings import RaceSettings
+from bayesrace.plant.world import NONE, get_world
 from bayesrace.sensors import get_sensors
 from bayesrace.studies.campaign.case import (
     CONTROLLERS,
@@ -183,6 +184,8 @@ class _Reader:
                 return self._car(value)
             if name == "sensors" and isinstance(value, str):
                 return get_sensors(self._folder / value if value.endswith(".toml") else value)
+            if name == "world" and isinstance(value, str):
+                return get_world(value if value == NONE else self._folder / value)
             if name in ("track", "train_track") and isinstance(value, str):
                 value = self._track(value)
             RaceSettings.model_validate(_nested({name: value}))
