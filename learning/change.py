@@ -32,12 +32,15 @@ from bayesrace.learning.validation import validate
 __all__ = ["brought_up_to_date", "changed_at"]
 
 _USUAL: Final = 4.0
-"""Mean square of errors over what the weights claim, up to which they are of the same car; first
-laps of an unchanged car on other tracks come to 1.8 at most, of changed ones to at least 9."""
-_MOST: Final = 16.0
-"""No single error counts for more."""
-_LEAST: Final = 50.0
-"""Excess, added up over the samples from the change on, by which it has to show."""
+"""Square of an error over the variance that the weights claim, up to which it says nothing; the
+mean over first laps of unchanged cars on other tracks is 2.1 at most."""
+_MOST: Final = 100.0
+"""No single error counts for more. Less grip shows in bends alone, and there by much."""
+_LEAST: Final = 200.0
+"""Excess, added up over the samples from the change on, by which it has to show; never above 0 for
+the first laps of 15 unchanged cars, at least 490 for as many with nine tenths of their grip."""
+_FEWEST: Final = 100
+"""Samples that a change is learned from; fewer are told from others by the next update."""
 _LEARNED: Final = 400
 """New samples that the difference is learned from at most."""
 _KERNEL: Final = "rbf"
@@ -55,7 +58,9 @@ def changed_at(dataset: Dataset, weights: GpWeights, discretisation: Discretisat
     excess = np.minimum((seen.error / seen.sigma) ** 2, _MOST) / _USUAL - 1
     sums = np.cumsum(excess[::-1], axis=0)
     back, output = np.unravel_index(int(np.argmax(sums)), sums.shape)
-    return None if sums[back, output] < _LEAST else len(dataset) - 1 - int(back)
+    if back + 1 < _FEWEST or sums[back, output] < _LEAST:
+        return None
+    return len(dataset) - 1 - int(back)
 
 
 def brought_up_to_date(
@@ -64,8 +69,8 @@ def brought_up_to_date(
     """The samples, in the order in which they were driven, as the car would do them now; and how
     many of them have been moved, from the first one on.
 
-    ``weights``: learned before the newest ones. None is moved if the car has not changed, or if all
-    are of the car as it is now.
+    ``weights``: learned before the newest ones. No sample is moved if the car has not changed, or
+    if all are of the car as it is now.
     """
     first = changed_at(dataset, weights, discretisation) if all(weights.counts) else None
     if not first:

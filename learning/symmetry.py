@@ -21,9 +21,9 @@ from bayesrace.learning.validation import residual
 __all__ = ["symmetric"]
 
 _NEWEST: Final = 600
-"""Samples that count, ..."""
+"""Samples that are asked, the newest ones."""
 _LOOKED_AT: Final = 200
-"""... and so many of them, evenly spread."""
+"""Of these, evenly spread, that a GP is made of at most."""
 _USUAL: Final = 6.0
 """Mean square of errors over what is claimed; 3.1 at most for symmetric cars, 13 at least where the
 steering is 1 degree off (18 drives each, ``orca``)."""

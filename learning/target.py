@@ -139,7 +139,8 @@ class Target:
         cls, name: str, z: Floats, y: Floats, folds: Rows, deviation: Floats | float = 0.0
     ) -> "Target":
         """From features and residual, with its deviation, in SI units."""
-        z_scale, y_mean, y_scale = z.std(axis=0), float(y.mean()), float(y.std())
+        z_scale, y_mean, y_scale = z.std(axis=0), float(y.mean()), float(y.std()) or 1.0
+        z_scale = np.where(z_scale > 0, z_scale, 1.0)
         return cls(
             name=name,
             z=(z - z.mean(axis=0)) / z_scale,

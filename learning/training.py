@@ -338,19 +338,22 @@ def perform(
     initial: Path | None,
     settings: TrainingSettings,
     keep: int,
+    known: Path | None = None,
 ) -> Outcome:
     """Learns from samples, in the order in which they were driven, and keeps ``keep`` of them.
 
-    ``initial``: weights to start the optimiser from; InputError if they are of another model or
-    damaged. What cannot be learned is in the outcome.
+    ``initial``: weights to start the optimiser from; ``known``: weights of the samples before the
+    newest ones, which tell whether the car has changed since. InputError if they are of another
+    model or damaged. What cannot be learned is in the outcome.
     """
     begin_s, every = time.monotonic(), concatenate(samples)
     before = None if initial is None else read_weights(initial)
     weights, error, moved = None, "", 0
     try:
-        if before is not None:
-            every, moved = brought_up_to_date(every, before, discretisation)
-        made = fit(every, discretisation, settings, before)
+        present = every
+        if known is not None:
+            present, moved = brought_up_to_date(every, read_weights(known), discretisation)
+        made = fit(present, discretisation, settings, before)
         weights, every = made.weights, made.samples
     except (InputError, ArithmeticError, ValueError) as reason:  # LinAlgError is a ValueError
         error = str(reason) or type(reason).__name__

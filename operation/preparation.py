@@ -21,7 +21,6 @@ from bayesrace.errors import InputError
 from bayesrace.files import read_whole, replacing
 from bayesrace.gp.weights import encode_weights, read_weights, write_weights
 from bayesrace.integrators import Discretisation
-from bayesrace.learning.change import brought_up_to_date
 from bayesrace.learning.dataset import Dataset, concatenate
 from bayesrace.learning.settings import Progress, TrainingSettings
 from bayesrace.learning.sources import CYCLES, STATES, dataset_from_columns
@@ -376,6 +375,8 @@ def updated_weights(
 
     ``samples``: in the order in which they were driven.
     """
+    from bayesrace.learning.change import brought_up_to_date  # a second, as train's
+
     every, model = concatenate(samples), settings.discretisation
     every, moved = brought_up_to_date(every, read_weights(first), model)
     if moved:

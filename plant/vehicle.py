@@ -280,6 +280,8 @@ def open_vehicle(
 
     Raises InputError if the FMU, the map, the rate or the car cannot be used.
     """
+    if world.root and (fmu is not None or simulator != "equations"):
+        raise InputError("world: only the built-in car can change while it drives")
     if fmu is None:
         if fmu_map is not None:
             raise InputError(f"map {fmu_map} without an FMU to apply it to: add --fmu")

@@ -251,7 +251,7 @@ def test_each_update_learns_from_all_laps_before_it(
 
 
 def test_a_campaign_varies_the_world(read: Read, tmp_path: Path) -> None:
-    """By files beside the plan; nothing of it reaches the controller."""
+    """By files beside the plan; BestCase does not know it, and is slower with a payload."""
     (tmp_path / "heavy.toml").write_text("[[world]]\nwhat = 'mass'\nshare = 1.5\n")
     text = """
         controllers = ["bestcase"]

@@ -10,12 +10,13 @@ from bayesrace.arrays import Floats
 from bayesrace.codegen.build import build
 from bayesrace.codegen.settings import BuildSettings
 from bayesrace.controller.assembly import compiled_controller
+from bayesrace.gp.weights import write_weights
 from bayesrace.integrators import PREDICTION
 from bayesrace.learning.change import brought_up_to_date
 from bayesrace.learning.dataset import Dataset, concatenate
 from bayesrace.learning.settings import TrainingSettings
 from bayesrace.learning.symmetry import symmetric
-from bayesrace.learning.training import train
+from bayesrace.learning.training import perform, train
 from bayesrace.learning.validation import residual
 from bayesrace.operation.closed_loop import ClosedLoop, Driven
 from bayesrace.operation.preparation import Prepared, training_settings, updated_weights
@@ -123,6 +124,33 @@ def driven(
         artefact, vehicle.car if weights is None else car, *on, weights
     )
     return ClosedLoop(car, *on, controller, vehicle).drive()
+
+
+def test_a_learning_job_moves_what_it_has_kept_once(tmp_path: Path) -> None:
+    """By the weights that know what was kept; also where no controller has accepted them."""
+    race, other = racing(), first_laps("grip 0.9")
+    small = TrainingSettings(kernels=("rbf",), capacity=150, hyper_points=150, restarts=0)
+    write_weights(tmp_path / "before.bin", race.weights)
+    samples, files = [trained(), other], [tmp_path / "before.bin", tmp_path / "after.bin"]
+    moved = []
+    for known in files:
+        done = perform(PREDICTION, samples, files[0], small, 1200, known)
+        assert done.weights is not None
+        assert done.kept is not None
+        moved.append(done.moved)
+        write_weights(files[1], done.weights)
+        samples = [done.kept, other]
+    assert abs(moved[0] - len(trained())) <= 10
+    assert moved[1] == 0
+
+
+def test_samples_stay_as_they_are_where_nothing_can_be_learned(tmp_path: Path) -> None:
+    write_weights(tmp_path / "known.bin", racing().weights)
+    few = first_laps("grip 0.9").select(slice(5))
+    done = perform(PREDICTION, [few], None, TrainingSettings(), 1200, tmp_path / "known.bin")
+    assert "samples" in done.error
+    assert done.kept is not None
+    assert done.kept.digest() == few.digest()
 
 
 @pytest.mark.check

@@ -191,7 +191,8 @@ class Learner:
         how = TrainingSettings(capacity=settings.points, seed=settings.seed, threads=threads)
         if samples is not None:
             model, first, keep = settings.discretisation, journal.initial, settings.keep
-            self._trainer.start(partial(perform, model, [samples], first, how, keep))
+            job = partial(perform, model, [samples], first, how, keep, journal.newest)
+            self._trainer.start(job)
 
     def _finish_training(self) -> None:
         if (outcome := self._trainer.poll()) is None:

@@ -98,6 +98,13 @@ class Journal:
         failed = updates and updates[-1].verdict in ("refused", "rolled back", "failed")
         return None if best is None or failed else self.folder / best.file
 
+    @property
+    def newest(self) -> Path | None:
+        """Weights of the samples that are kept, whatever a controller said of them."""
+        made = (self.folder / one.file for one in reversed(self.record.updates) if one.file)
+        newest = next(made, None)
+        return newest if newest is not None and newest.is_file() else None
+
     def update_of(self, version: str) -> UpdateRecord | None:
         """The last update of this version; None if it is not one of this job's."""
         updates = (one for one in reversed(self.record.updates) if one.version == version)

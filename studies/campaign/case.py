@@ -264,11 +264,12 @@ class _Runs:
             return self._files.weights, self._files.samples
         sources = LEARNS_FROM[controller]
         if sources not in self._updates:
-            before, samples = self._learned(sources[-1])
-            if sources[-1] not in self._runs or not samples:
-                who = sources[-1] if samples else "the training drive"
+            last = sources[-1]
+            if last not in self._runs or not self._files.samples:
+                who = last if self._files.samples else "the training drive"
                 raise RuntimeError(f"there are no laps of {who} to learn from")
-            samples = [*samples, self._runs[sources[-1]].samples()]
+            before, samples = self._learned(last)
+            samples = [*samples, self._runs[last].samples()]
             weights, every = preparation.updated_weights(samples, self._settings, before)
             self._updates[sources] = weights, [every]
         return self._updates[sources]
