@@ -12,21 +12,27 @@ import tomllib
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
-from bayesrace.errors import InputError
+from bayesrace.errors import InputError, faults_in
+
+if TYPE_CHECKING:
+    from pydantic import BaseModel
 
 __all__ = [
     "claimed",
     "clear_partials",
     "held",
     "parse_toml",
+    "read_form",
     "read_text",
     "read_whole",
     "replacing",
     "temporary_folder",
     "write_whole",
 ]
+
+Form = TypeVar("Form", bound="BaseModel")
 
 _LARGEST: Final = 1 << 22
 _PREFIX: Final = "bayesrace-held-"
@@ -78,6 +84,17 @@ def parse_toml(text: str, name: object, remedy: str) -> dict[str, Any]:
         f"{name}: {heads[again - 1]} stands in line {earlier[-1]} and again in line {again}: write "
         "all of it in one of these places, and remove the other"
     )
+
+
+def read_form(path: Path, what: str, remedy: str, form: type[Form]) -> Form:
+    """A TOML file by its pydantic model; InputError naming it, every fault and the remedy."""
+    from pydantic import ValidationError  # takes time, and --help needs none
+
+    content = parse_toml(read_text(path, what, remedy), path, remedy)
+    try:
+        return form.model_validate(content)
+    except ValidationError as error:
+        raise InputError(f"{path}: {faults_in(error, 'the file', form)}") from None
 
 
 @contextmanager

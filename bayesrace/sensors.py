@@ -17,13 +17,12 @@ from pydantic import (
     ConfigDict,
     Field,
     RootModel,
-    ValidationError,
     model_validator,
 )
 
 from bayesrace.defaults import Option
-from bayesrace.errors import InputError, faults_in
-from bayesrace.files import parse_toml, read_text, write_whole
+from bayesrace.errors import InputError
+from bayesrace.files import read_form, write_whole
 from bayesrace.messages import MOST_INSTRUMENTS, MOST_READINGS
 
 __all__ = [
@@ -196,12 +195,7 @@ def get_sensors(given: str | Path) -> Sensors:
         return BUILT_IN[name]
     if Path(given).suffix != ".toml":
         raise InputError(f"unknown '{name[:60]}': give {', '.join(BUILT_IN)}, or a file (*.toml)")
-    remedy = "docs/sensors.md shows one"
-    content = parse_toml(read_text(Path(given), "the sensors", remedy), given, remedy)
-    try:
-        return _File.model_validate(content).sensors
-    except ValidationError as error:
-        raise InputError(f"{given}: {faults_in(error, 'the file', _File)}") from None
+    return read_form(Path(given), "the sensors", "docs/sensors.md shows one", _File).sensors
 
 
 SensorsSetting = Annotated[

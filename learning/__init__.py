@@ -9,9 +9,9 @@ In the order of use:
 2. :mod:`.gaussian_process` predicts with a GP, and finds its hyperparameters.
 3. :mod:`.subset` chooses the samples that a GP keeps, and those that cross-validation leaves out.
    :mod:`.target` is one output to learn, and scores predictions of it.
-4. :mod:`.symmetry` tells whether mirror images may be learned from. :mod:`.change` brings samples
-   from before a car has changed up to date. :mod:`.training` puts these together, also lap by lap
-   in another process.
+4. :mod:`.symmetry` checks that a car turns left as it turns right, and :mod:`.change` whether it
+   has changed, and adapts older samples if so. :mod:`.training` puts these together, also lap by
+   lap in another process.
 5. :mod:`.validation` computes what the nominal model misses, and compares weights with another
    drive.
 6. :mod:`.identification` finds the numbers of a car's file: :mod:`.instruments` reads what was

@@ -16,20 +16,18 @@ from dataclasses import replace
 from typing import Final
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from bayesrace.arrays import Floats
-from bayesrace.gp.weights import OUTPUTS, GpWeights
+from bayesrace.gp.weights import GpWeights
 from bayesrace.integrators import Discretisation
 from bayesrace.learning.dataset import Dataset, concatenate
 from bayesrace.learning.drives import Estimates
-from bayesrace.learning.gaussian_process import PairDistances, maximise, starts
 from bayesrace.learning.subset import evenly
 from bayesrace.learning.symmetry import symmetric
-from bayesrace.learning.target import Target
+from bayesrace.learning.target import interpolated
 from bayesrace.learning.validation import validate
 
-__all__ = ["brought_up_to_date", "changed_at"]
+__all__ = ["brought_up_to_date", "said"]
 
 _USUAL: Final = 4.0
 """Square of an error over the variance that the weights claim, up to which it says nothing; the
@@ -40,14 +38,12 @@ _LEAST: Final = 200.0
 """Excess, added up over the samples from the change on, by which it has to show; never above 0 for
 the first laps of 15 unchanged cars, at least 490 for as many with nine tenths of their grip."""
 _FEWEST: Final = 100
-"""Samples that a change is learned from; fewer are told from others by the next update."""
+"""Samples that a change is learned from at least; a shorter one waits for the next update."""
 _LEARNED: Final = 400
 """New samples that the difference is learned from at most."""
-_KERNEL: Final = "rbf"
-_ITERATIONS: Final = 50
 
 
-def changed_at(dataset: Dataset, weights: GpWeights, discretisation: Discretisation) -> int | None:
+def _changed_at(dataset: Dataset, weights: GpWeights, discretisation: Discretisation) -> int | None:
     """Number of the first sample of the car as it is now; None: it is the car of the weights.
 
     ``dataset``: in the order in which it was driven. What errors exceed the usual by is added up
@@ -72,7 +68,7 @@ def brought_up_to_date(
     ``weights``: learned before the newest ones. No sample is moved if the car has not changed, or
     if all are of the car as it is now.
     """
-    first = changed_at(dataset, weights, discretisation) if all(weights.counts) else None
+    first = _changed_at(dataset, weights, discretisation) if all(weights.counts) else None
     if not first:
         return dataset, 0
     before, after = dataset.select(slice(first)), dataset.select(slice(first, None))
@@ -84,6 +80,14 @@ def brought_up_to_date(
     return concatenate([moved, after]), first
 
 
+def said(moved: int, count: int) -> str:
+    """That ``moved`` of ``count`` samples have been brought up to date, in words."""
+    return (
+        f"the car is another one since sample {moved + 1} of {count}: the samples before were "
+        "moved by what is new, and count for less"
+    )
+
+
 def _change(
     before: Dataset, after: Dataset, weights: GpWeights, discretisation: Discretisation
 ) -> tuple[Floats, Floats]:
@@ -93,18 +97,8 @@ def _change(
     after = after.select(evenly(len(after), _LEARNED))
     if mirrored:
         after = after.with_mirror_images()
-    seen, z = validate(weights, after, discretisation), after.features
-    folds = np.zeros(len(after), dtype=np.int64)
-    columns = []
-    with threadpool_limits(1, "blas"):
-        for name, missed, sigma in zip(OUTPUTS, seen.error.T, seen.sigma.T, strict=True):
-            target = Target.of(name, z, missed, folds, sigma)
-            pairs = PairDistances(target.z)
-            start = starts(0, 0)[0]
-            fit = maximise(_KERNEL, pairs, target.y, start, _ITERATIONS, known=target.known)
-            found = target.posterior(np.arange(len(after)), fit.covariance)
-            at = (before.features - z.mean(axis=0)) / target.z_scale
-            mean, deviation = found.predict(at)
-            columns.append((target.y_mean + target.y_scale * mean, target.y_scale * deviation))
-    means, deviations = zip(*columns, strict=True)
+    seen = validate(weights, after, discretisation)
+    columns = zip(seen.error.T, seen.sigma.T, strict=True)
+    found = [interpolated(after.features, *one, before.features) for one in columns]
+    means, deviations = zip(*found, strict=True)
     return np.column_stack(means), np.column_stack(deviations)

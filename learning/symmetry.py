@@ -9,13 +9,11 @@ of a car with a side.
 from typing import Final
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from bayesrace.integrators import Discretisation
 from bayesrace.learning.dataset import Dataset
-from bayesrace.learning.gaussian_process import PairDistances, maximise, starts
 from bayesrace.learning.subset import evenly
-from bayesrace.learning.target import Target
+from bayesrace.learning.target import interpolated
 from bayesrace.learning.validation import residual
 
 __all__ = ["symmetric"]
@@ -29,7 +27,6 @@ _USUAL: Final = 6.0
 steering is 1 degree off (18 drives each, ``orca``)."""
 _MOST: Final = 16.0
 """No single error counts for more."""
-_ITERATIONS: Final = 50
 
 
 def symmetric(dataset: Dataset, discretisation: Discretisation) -> bool:
@@ -39,18 +36,10 @@ def symmetric(dataset: Dataset, discretisation: Discretisation) -> bool:
     newest = dataset.select(slice(-_NEWEST, None))
     newest = newest.select(evenly(len(newest), _LOOKED_AT))
     both = newest.with_mirror_images()
-    z, y = both.features, residual(both, discretisation)
-    own = np.zeros(len(newest), dtype=np.int64)
-    with threadpool_limits(1, "blas"):
-        for errors, spread in zip(y.T, both.deviation.T[:3], strict=True):
-            target = Target.of("", z[::2], errors[::2], own, spread[::2])
-            pairs, first = PairDistances(target.z), starts(0, 0)[0]
-            fit = maximise("rbf", pairs, target.y, first, _ITERATIONS, known=target.known)
-            found = target.posterior(np.arange(len(newest)), fit.covariance)
-            images = (z[1::2] - z[::2].mean(axis=0)) / target.z_scale
-            mean, sigma = found.predict(images)
-            missed = (errors[1::2] - target.y_mean) / target.y_scale - mean
-            square = missed**2 / (sigma**2 + target.known)
-            if np.minimum(square, _MOST).mean() > _USUAL:
-                return False
+    z, y, deviation = both.features, residual(both, discretisation), newest.deviation
+    for errors, spread in zip(y.T, deviation.T[:3], strict=True):
+        mean, sigma = interpolated(z[::2], errors[::2], spread, z[1::2])
+        square = (errors[1::2] - mean) ** 2 / (sigma**2 + spread**2)
+        if np.minimum(square, _MOST).mean() > _USUAL:
+            return False
     return True

@@ -21,20 +21,31 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from bayesrace.arrays import Floats, Rows
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import GpOutput
-from bayesrace.learning.gaussian_process import Covariance, Fit, Posterior
+from bayesrace.learning.gaussian_process import (
+    Covariance,
+    Fit,
+    PairDistances,
+    Posterior,
+    maximise,
+    starts,
+)
 from bayesrace.learning.subset import evenly
 
-__all__ = ["NORMAL_95", "KernelScore", "PredictionErrors", "Target"]
+__all__ = ["NORMAL_95", "KernelScore", "PredictionErrors", "Target", "interpolated"]
 
 NORMAL_95: Final = 1.959963984540054
 """Half the width of the 95 % interval, in standard deviations."""
 
 _TESTS: Final = 2000
 """Samples that a GP is judged by at most, evenly spread over all."""
+
+_ITERATIONS: Final = 50
+"""Of the optimiser, for a GP that is not published."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,3 +228,18 @@ class Target:
             rmse, density = errors.rmse * self.y_scale, errors.log_density - math.log(self.y_scale)
             scores.append(KernelScore(self.name, fit.kind, rmse, density, fit is chosen))
         return chosen, scores
+
+
+def interpolated(z: Floats, y: Floats, deviation: Floats, at: Floats) -> tuple[Floats, Floats]:
+    """Mean and standard deviation, noise included, (m,) each, at features ``at`` (m, 6).
+
+    By a GP with an RBF kernel, from one start, of samples with features ``z`` (n, 6) and one output
+    ``y`` (n,), whose standard deviations are ``deviation`` (n,); all in SI units.
+    """
+    target = Target.of("", z, y, np.zeros(len(z), dtype=np.int64), deviation)
+    first, pairs = starts(0, 0)[0], PairDistances(target.z)
+    with threadpool_limits(1, "blas"):
+        fit = maximise("rbf", pairs, target.y, first, _ITERATIONS, known=target.known)
+        posterior = target.posterior(np.arange(len(z)), fit.covariance)
+        mean, sigma = posterior.predict((at - z.mean(axis=0)) / target.z_scale)
+    return target.y_mean + target.y_scale * mean, target.y_scale * sigma

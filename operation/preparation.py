@@ -375,15 +375,12 @@ def updated_weights(
 
     ``samples``: in the order in which they were driven.
     """
-    from bayesrace.learning.change import brought_up_to_date  # a second, as train's
+    from bayesrace.learning.change import brought_up_to_date, said  # a second, as train's
 
     every, model = concatenate(samples), settings.discretisation
     every, moved = brought_up_to_date(every, read_weights(first), model)
     if moved:
-        _log.warning(
-            "the car is another one since sample %d of %d: the samples before were moved by what "
-            "is new, and count for less", moved + 1, len(every),
-        )  # fmt: skip
+        _log.warning("%s", said(moved, len(every)))
     return trained_weights(every, model, training_settings(settings), first, progress), every
 
 

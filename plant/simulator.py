@@ -80,9 +80,8 @@ class Simulator(Vehicle):
         substep = Discretisation(
             scheme=discretisation.scheme, step_s=self.step_s / self.substeps, substeps=1
         )
-        self._world, self._shares = world, world.shares(0.0, 0.0, 0.0)
+        self._world, self._shares = world, UNCHANGED.shares(0.0, 0.0, 0.0)
         self._parameters = np.array(model.parameters, dtype=np.float64)
-        self._change()
         function = substep.for_any_car(model)
         function = compiled(function) if compiled else function
         self._equations = _Substeps(function, self.x, self._u, self._parameters)
@@ -91,17 +90,17 @@ class Simulator(Vehicle):
         self.x[:] = start
 
     def _change(self) -> None:
-        """To the car with the present shares."""
-        if self._world.root:
-            numbers = changed_car(self.car, self._shares).equation_numbers
+        """To the car as it is at this time and place."""
+        shares = self._world.shares(self.time_s, float(self.x[0]), float(self.x[1]))
+        if shares != self._shares:
+            self._shares = shares
+            numbers = changed_car(self.car, shares).equation_numbers
             self._parameters[:] = list(numbers.values())
 
     def _hold(self, u: Command, count: int) -> tuple[float, float]:
         """For so many substeps; what acted."""
         x, duration_s = self.x, self.step_s * count / self.substeps
-        shares = self._world.shares(self.time_s, float(x[0]), float(x[1]))
-        if shares != self._shares:
-            self._shares = shares
+        if self._world.root:
             self._change()
         delta = float(x[6])
         applied = self.guard.apply(u, x, duration_s)

@@ -1,13 +1,13 @@
 """What changes while a simulated car drives: grip that falls in a bend or with the time, a payload,
 a motor that gets weak. ``--world FILE`` names a TOML file of sections ``[[world]]``.
 
-Nobody is told. Weights, racing line and BestCase know the car as it is without.
+No controller knows of it: weights, racing line and BestCase are those of the car in its file.
 """
 
 import hashlib
 import json
 from pathlib import Path
-from typing import Annotated, Final, Literal, Self
+from typing import Annotated, Final, Literal, Self, get_args
 
 from pydantic import (
     BaseModel,
@@ -15,13 +15,12 @@ from pydantic import (
     ConfigDict,
     Field,
     RootModel,
-    ValidationError,
     model_validator,
 )
 
 from bayesrace.defaults import Option
-from bayesrace.errors import InputError, faults_in
-from bayesrace.files import parse_toml, read_text, write_whole
+from bayesrace.errors import InputError
+from bayesrace.files import read_form, write_whole
 from bayesrace.vehicles import CarParameters
 from bayesrace.vehicles.parts import DcMotor
 
@@ -30,8 +29,7 @@ __all__ += ["write_world"]
 
 What = Literal["grip", "mass", "motor"]
 
-_WHATS: Final[tuple[What, ...]] = ("grip", "mass", "motor")
-_REMEDY: Final = "docs/world.md shows one"
+_WHATS: Final[tuple[What, ...]] = get_args(What)
 
 
 class Change(BaseModel):
@@ -139,11 +137,7 @@ def get_world(path: str | Path) -> World:
     """What a TOML file says; ``none``: nothing changes. InputError where it cannot be used."""
     if str(path) == NONE:
         return UNCHANGED
-    content = parse_toml(read_text(Path(path), "the world", _REMEDY), path, _REMEDY)
-    try:
-        return _File.model_validate(content).world
-    except ValidationError as error:
-        raise InputError(f"{path}: {faults_in(error, 'the file', _File)}") from None
+    return read_form(Path(path), "the world", "docs/world.md shows one", _File).world
 
 
 def write_world(path: Path, world: World) -> None:
@@ -162,7 +156,7 @@ WorldSetting = Annotated[
     Option(metavar="FILE"),
     Field(
         description="what changes while the simulated car drives: grip, mass, motor, by time and "
-        "place (TOML, docs/world.md); nobody is told, training drives are without"
+        "place (TOML, docs/world.md); no controller knows of it, and training drives are without"
     ),
 ]
 """Field of settings that accepts a file and holds what it says."""

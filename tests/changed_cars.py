@@ -1,4 +1,4 @@
-"""Cars that are not their file: what a simulated car does, unknown to whoever drives it."""
+"""Simulated cars that differ from their file, which is all that the controller knows."""
 
 from collections.abc import Callable, Mapping
 from typing import Final
@@ -11,7 +11,7 @@ from bayesrace.plant.simulator import Simulator
 from bayesrace.vehicles import CarParameters
 from bayesrace.vehicles.models import Model, dynamic
 
-__all__ = ["CHANGES", "changed", "simulated", "trimmed"]
+__all__ = ["CHANGES", "changed", "trimmed"]
 
 TRIM_RAD: Final = float(np.deg2rad(1.0))
 
@@ -38,7 +38,7 @@ CHANGES: Final[Mapping[str, Callable[[CarParameters], CarParameters]]] = {
 def changed(car: CarParameters, how: str) -> Simulator:
     """The car that drives."""
     turned = TRIM_RAD if how == "trim 1 degree" else 0.0
-    return simulated(trimmed(dynamic(CHANGES[how](car)), turned))
+    return Simulator(trimmed(dynamic(CHANGES[how](car)), turned), compiled=compiled)
 
 
 def trimmed(model: Model, by_rad: float) -> Model:
@@ -54,8 +54,3 @@ def trimmed(model: Model, by_rad: float) -> Model:
         model.name, [x, u, p], [model.any_car(turned, u, p)], ["x", "u", "p"], ["xdot"]
     )
     return Model(model.name, model.car, ode, any_car=every, parameters=model.parameters)
-
-
-def simulated(model: Model) -> Simulator:
-    """Compiled, as :func:`bayesrace.operation.closed_loop.built_in_car`."""
-    return Simulator(model, compiled=compiled)

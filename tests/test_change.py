@@ -18,13 +18,13 @@ from bayesrace.learning.settings import TrainingSettings
 from bayesrace.learning.symmetry import symmetric
 from bayesrace.learning.training import perform, train
 from bayesrace.learning.validation import residual
-from bayesrace.operation.closed_loop import ClosedLoop, Driven
+from bayesrace.operation.closed_loop import ClosedLoop, Driven, built_in_car
 from bayesrace.operation.preparation import Prepared, training_settings, updated_weights
 from bayesrace.operation.settings import PreparationSettings
 from bayesrace.plant.simulator import PLANT, Simulator
 from bayesrace.vehicles import default_car
 from bayesrace.vehicles.models import Model, dynamic
-from tests.changed_cars import CHANGES, TRIM_RAD, changed, simulated, trimmed
+from tests.changed_cars import CHANGES, TRIM_RAD, changed, trimmed
 from tests.racing import prepared, racing
 
 CHANGED = [how for how in CHANGES if how != "as in the file"]
@@ -164,7 +164,7 @@ def test_a_changed_car_drives_as_if_it_were_known_after_one_update(how: str) -> 
         car = default_car()
 
         known = CHANGES[how](car)
-        perfect = driven(files, build(BuildSettings.best_case(known))[0], simulated(dynamic(known)))
+        perfect = driven(files, build(BuildSettings.best_case(known))[0], built_in_car(known))
         first = driven(files, files.artefacts[0], changed(car, how), files.weights)
         samples = [*files.samples, first.samples()]
         updated, _ = updated_weights(samples, settings, files.weights)

@@ -15,6 +15,7 @@ from typing import Any, Final
 
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import read_weights
+from bayesrace.learning.change import said
 from bayesrace.learning.settings import TrainingSettings
 from bayesrace.learning.sources import read_samples
 from bayesrace.learning.training import Trainer, perform
@@ -213,10 +214,7 @@ class Learner:
             self._say(f"nothing learned after lap {update.after_lap}: {update.answer}")
             return
         if update.moved:
-            self._say(
-                f"the car is another one since sample {update.moved + 1} of {update.samples}: the "
-                "samples before were moved by what is new, and count for less"
-            )
+            self._say(said(update.moved, update.samples))
         self._say(
             f"learned after lap {update.after_lap}: {update.version}, {update.points} points of "
             f"{update.samples} samples in {update.training_s:.1f} s, {update.kept} kept"
