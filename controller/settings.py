@@ -47,9 +47,9 @@ class MpcSettings(BaseModel):
         0.95,
         ge=0,
         lt=1,
-        description="probability with which each stage of the plan is to stay on the track in "
-        "spite of the learned model's uncertainty, from 0.5 on; 0: the paper's controller, which "
-        "takes the model's mean for the truth",
+        description="probability with which the car is within the tube of its plan, by the learned "
+        "model's uncertainty, from 0.5 on; where the tube takes half of the track, the car slows "
+        "down. 0: the paper's controller, which takes the model's mean for the truth",
     )
     tolerance: float = Field(1e-6, gt=0, description="KKT residual of a converged step")
     defect_max: float = Field(

@@ -239,7 +239,7 @@ def _practice(
 ) -> Training | None:
     """The controller's own laps, from the cache if they are there; None, with a warning, where
     they say nothing."""
-    learned, laps = read_weights(weights), settings.practice_laps or 0
+    learned, laps = read_weights(weights), settings.practice_laps
 
     def make(partial: Path) -> None:
         controller = compiled_controller(artefact, car, on.track, on.line, learned)

@@ -1,7 +1,7 @@
 """Settings of a race, as one resolved object that goes into the run directory."""
 
 from pathlib import Path
-from typing import Annotated, Final, Literal, Self
+from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -19,9 +19,6 @@ __all__ = ["BayesianSettings", "PreparationSettings", "RaceSettings", "TimeMode"
 
 TimeMode = Literal["lockstep", "realtime"]
 """How time passes in a run."""
-
-_PRACTICE_LAPS: Final = 3
-"""Where states are estimated."""
 
 
 class PreparationSettings(CarSimulation):
@@ -52,13 +49,12 @@ class PreparationSettings(CarSimulation):
         le=3600,
         description="length of the training drives [s]; None: the car's, and a lap at least",
     )
-    practice_laps: int | None = Field(
-        None,
+    practice_laps: int = Field(
+        3,
         ge=0,
         le=100,
         description="laps of the training track by the controller itself, with its default "
-        "settings, which it learns from before it races; None: 3 where states are estimated, none "
-        "where they are measured",
+        "settings, which it learns from before it races",
     )
     points: int = Field(400, ge=20, le=1024, description="training points per output")
     kernels: tuple[Kernel, ...] = Field(
@@ -90,9 +86,6 @@ class PreparationSettings(CarSimulation):
     def _of_the_car(self) -> Self:
         """What is not stated and the car knows."""
         object.__setattr__(self, "train_track", self.train_track or self.car.train_track)
-        if self.practice_laps is None:
-            laps = _PRACTICE_LAPS if self.instruments.root else 0
-            object.__setattr__(self, "practice_laps", laps)
         return self
 
     @property

@@ -238,6 +238,7 @@ def test_each_update_learns_from_all_laps_before_it(
         track = "peanut.csv"
         train_track = "peanut.csv"
         collect_s = 8
+        practice_laps = 0
         points = 100
         kernels = ["rbf"]
     """

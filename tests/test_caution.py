@@ -175,27 +175,43 @@ def test_the_reference_does_not_leap_when_nothing_is_uncertain_any_more(
     assert step.info.pace == pytest.approx(faster * paces[-1])
 
 
-@pytest.mark.parametrize(("side", "bound"), [(1, 5), (-1, 4)])
-def test_the_plan_keeps_its_uncertainty_away_from_the_edge(
-    make: Make, car: CarParameters, weights: GpWeights, circuit: Circuit, side: int, bound: int
+def test_the_plan_is_not_pushed_by_its_tube(
+    make: Make, car: CarParameters, unsure: GpWeights, circuit: Circuit
 ) -> None:
-    """Of a track that ends 1 cm beside the line, on either side."""
-    step = make(noisy(weights, 10), caution=0.95)
+    """Uncertainty slows the reference down; for the same reference the plan is the same."""
+    step = make(unsure, caution=0.95)
     x, u, _ = driven(step, car, circuit.start(), np.zeros(2), 25)
-    line = step.read_reference()
-    along = np.sum(line[:, 2:4] * line[:, :2], axis=1)
-    line[:, bound] = along + side * 0.01
-    lateral = {}
-    for caution in (0.0, 0.95):
-        hard = CAUTIOUS.model_copy(update={"s_slack": 1e5, "caution": caution})
-        step.set_parameters(car, hard)
+    line, plans, tubes = step.read_reference(), [], []
+    for caution in (0.6, 0.999):
+        step.set_parameters(car, CAUTIOUS.model_copy(update={"caution": caution}))
         for _ in range(20):
             assert step.solve(x, u, line, elapsed_s=0.0).usable
-        plan, _ = step.read_plan()
-        lateral[caution] = side * (np.sum(line[:, 2:4] * plan[1:, :2], axis=1) - along)
-    room = 0.01 - step.read_tube()
-    assert (lateral[0.95] <= room + 1e-4).all()
-    assert (lateral[0.0] > room + 0.02).any()
+        plans.append(step.read_plan()[1].copy())
+        tubes.append(step.info.tube_m)
+    assert tubes[1] > 10 * tubes[0] > 0
+    np.testing.assert_allclose(plans[1], plans[0], atol=1e-3)
+
+
+def test_the_reference_slows_down_no_faster_than_the_car_can_brake(
+    make: Make, car: CarParameters, weights: GpWeights, circuit: Circuit
+) -> None:
+    """On half the grip, which the mismatch explains in part only. The rest of what the pace does is
+    the line's speed as far as the weights know it, which is hardly less than the line's here."""
+    step, oracle = make(weights, caution=0.95), make(weights)
+    slippery = car.model_copy(update={"tyres": car.true_tyres.with_grip(0.5)})
+    plant, x, u = discrete(dynamic(slippery)), circuit.start(), np.zeros(2)
+    paces, able = [1.0], []
+    for _ in range(80):
+        assert step.step(x, u).usable
+        u, v = step.u.copy(), step.read_plan()[0][0, 3]
+        braking = np.array([0, 0, 0, v, 0, 0, 0]), np.array([car.d_min, 0])
+        able.append(1 - oracle.predict(*braking, PREDICTION.step_s)[3] / v)
+        paces.append(step.info.pace)
+        x = plant(x, u)
+    falls = 1 - np.divide(paces[1:], paces[:-1])
+    assert (falls < np.array(able) + 2e-3).all()
+    assert (np.abs(falls - able)[falls > 0.02] < 2e-3).any()
+    assert min(paces) < 0.8
 
 
 def test_a_track_that_is_no_constraint_does_not_slow_the_car_down(
@@ -236,7 +252,7 @@ def test_shares_in_the_tuning_are_shares(car: CarParameters, change: dict[str, f
 
 
 @pytest.mark.check
-def test_first_laps_on_slippery_tyres_stay_on_the_track() -> None:
+def test_practice_keeps_first_laps_on_slippery_tyres_on_the_track() -> None:
     """The tyres give 18 % less than the racing line asks for: the plan leaves what was driven.
 
     The samples' mirror images alone would keep this car on this track, and so would a training
@@ -244,15 +260,17 @@ def test_first_laps_on_slippery_tyres_stay_on_the_track() -> None:
     """
     one_sided = default_car().model_copy(update={"mirrored_samples": False})
     calm = PurePursuitSettings(speed_scale=0.6)
-    settings = RaceSettings(track="harbour", true_grip=0.82, car=one_sided, pursuit=calm)
-    with stages_on(Console(quiet=True)) as stages:
-        files = prepare(settings, (settings.track,), stages)
-    weights = read_weights(files.weights)
     deepest = []
-    for mpc in (MpcSettings(caution=0.0), MpcSettings()):
+    for laps in (0, 3):
+        settings = RaceSettings(
+            track="harbour", true_grip=0.82, car=one_sided, pursuit=calm, practice_laps=laps
+        )
+        with stages_on(Console(quiet=True)) as stages:
+            files = prepare(settings, (settings.track,), stages)
         on, line, car = files.first.track, files.first.line, settings.car
-        controller = compiled_controller(files.artefacts[0], car, on, line, weights, mpc)
+        weights = read_weights(files.weights)
+        controller = compiled_controller(files.artefacts[0], car, on, line, weights)
         loop = ClosedLoop(car, on, line, controller, built_in_car(settings.true_car))
         deepest.append(float(loop.drive(2).off_track_m.max()))
-    assert deepest[0] > 0.05
+    assert deepest[0] > 0.02
     assert deepest[1] <= 0

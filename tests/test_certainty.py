@@ -19,6 +19,7 @@ from bayesrace.operation.preparation import Prepared, prepare
 from bayesrace.operation.settings import RaceSettings
 from bayesrace.operation.terminal.terminal import stages_on
 from bayesrace.tracks import Track, write_track
+from tests.changed_cars import changed
 from tests.conftest import CAUTIOUS
 from tests.racing import racing
 from tests.reference import reference_file
@@ -29,7 +30,9 @@ SPEED = 2  # column of the table
 @functools.cache
 def slowly_trained() -> tuple[Prepared, RaceSettings]:
     """A car that was driven at half of the line's speed in training."""
-    settings = RaceSettings(track="harbour", pursuit=PurePursuitSettings(speed_scale=0.5))
+    settings = RaceSettings(
+        track="harbour", pursuit=PurePursuitSettings(speed_scale=0.5), practice_laps=0
+    )
     with stages_on(Console(quiet=True)) as stages:
         return prepare(settings, (settings.track,), stages), settings
 
@@ -209,14 +212,36 @@ def test_first_laps_faster_than_all_training_stay_on_the_track() -> None:
     assert deepest_m(*slowly_trained(), 0.95) <= 0
 
 
-@pytest.mark.check
-def test_a_faster_track_than_that_of_the_training_is_not_left(tmp_path: Path) -> None:
-    """Spielberg at 1:43, the other way round: its fast bends were in no training drive."""
+def fast_race(folder: Path, practice_laps: int) -> tuple[Prepared, RaceSettings]:
+    """Spielberg at 1:43, the other way round: its fast bends are in no training drive."""
     rows = np.loadtxt(reference_file("tracks/f1tenth_spielberg_centerline.csv"), delimiter=",")
     x, y, right, left = (10 / 43 * rows[::-1]).T
     track = Track.from_points("fast", np.column_stack([x, y]), left, right)
-    write_track(tmp_path / "fast.csv", track)
-    settings = RaceSettings(track=str(tmp_path / "fast.csv"))
+    write_track(folder / "fast.csv", track)
+    settings = RaceSettings(track=str(folder / "fast.csv"), practice_laps=practice_laps)
     with stages_on(Console(quiet=True)) as stages:
-        files = prepare(settings, (settings.track,), stages)
-    assert deepest_m(files, settings, 0.95) <= 0
+        return prepare(settings, (settings.track,), stages), settings
+
+
+@pytest.mark.check
+def test_a_faster_track_than_that_of_the_training_is_not_left(tmp_path: Path) -> None:
+    assert deepest_m(*fast_race(tmp_path, 0), 0.95) <= 0
+
+
+@pytest.mark.check
+def test_a_changed_car_does_not_follow_its_model_into_a_slide(tmp_path: Path) -> None:
+    """Where nothing is known the corrected model lets sliding tyres pull the car, and plans for a
+    car that has to be slower than its brakes allow slide: each of these cars has left this track.
+    """
+    files, settings = fast_race(tmp_path, 3)
+    on, weights, laps_s = files.first, read_weights(files.weights), {}
+    for how in ("as in the file", "trim 1 degree", "motor + 10 %", "mass + 20 %", "grip 0.9"):
+        controller = compiled_controller(
+            files.artefacts[0], settings.car, on.track, on.line, weights
+        )
+        car = changed(settings.car, how)
+        driven = ClosedLoop(settings.car, on.track, on.line, controller, car).drive(2)
+        assert driven.off_track_m.max() < 2e-3, how
+        laps_s[how] = driven.laps_s
+    slowest = np.max(list(laps_s.values()), axis=0) / laps_s["as in the file"]
+    assert (slowest < 1.06).all()

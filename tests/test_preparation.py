@@ -20,12 +20,11 @@ from bayesrace.operation.settings import PreparationSettings
 from bayesrace.operation.terminal.terminal import stages_on
 from bayesrace.plant.car import End
 from bayesrace.raceline import RaceLineSettings
-from bayesrace.sensors import get_sensors
 from bayesrace.tracks import Track
 from tests.car_fmu import packed_car
 from tests.conftest import offset_line
 
-SETTINGS = PreparationSettings(train_track="random:2", collect_s=2.0)
+SETTINGS = PreparationSettings(train_track="random:2", collect_s=2.0, practice_laps=0)
 
 Preparing = Callable[..., tuple[Prepared, list[str]]]
 
@@ -193,12 +192,6 @@ def test_practice_that_says_nothing_is_left_out(
     assert prepared.training is not None
     assert prepared.samples == [prepared.training.samples]
     assert "the practice on random:2 is left out: no two states follow one another" in caplog.text
-
-
-def test_there_is_practice_where_states_are_estimated() -> None:
-    assert PreparationSettings().practice_laps == 0
-    assert PreparationSettings(sensors=get_sensors("mocap")).practice_laps == 3
-    assert PreparationSettings(sensors=get_sensors("mocap"), practice_laps=0).practice_laps == 0
 
 
 def test_a_track_without_the_room_is_trained_on_with_less(

@@ -61,7 +61,7 @@ def test_the_converged_step_is_the_solution_of_ipopt(
     for k in range(120):
         assert step.step(x, d).usable
         u = step.u.copy()
-        if k % 20 == 10:
+        if k % 15 == 10:
             reference = step.read_reference()
             step.set_parameters(car, exact)
             status = step.solve(x, d, reference, elapsed_s=0.0)

@@ -329,6 +329,8 @@ def test_in_real_time_it_drives_too_and_a_second_race_prepares_nothing(
         "build the controllers",
         "training drive (pure pursuit)",
         "train the residual",
+        "practice, peanut",
+        "train the residual with practice",
         "limit, peanut",
     ]
     result = race.result

@@ -45,7 +45,7 @@ _SOLVER: Final = (
     ("early_stop_tol", _FROM_0,
      "a step ends at this stationarity and tenth of it as defect, or earlier: see br_step.c"),
     ("caution_sigmas", _FROM_0,
-     "standard deviations of the residual by which rows are tightened; 0: none"),
+     "standard deviations of the residual that a plan's tube is wide to either side; 0: none"),
     ("iterations", _COUNT,
      "SQP iterations a step without budget may use, once the defect is below 0.01"),
     ("iterations_cold", _COUNT,

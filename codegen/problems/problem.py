@@ -86,7 +86,8 @@ class Row:
     penalty: ca.SX | None = None
     """Weight of the squared violation, of theta alone; 0 switches the row off."""
     cautious: bool = False
-    """Whether the residual's uncertainty tightens it; for soft rows only."""
+    """Whether the car slows down where the residual's uncertainty takes much of the room between
+    its bounds; for soft rows only."""
 
     @property
     def soft(self) -> bool:
@@ -216,7 +217,7 @@ class Problem:
             raise ValueError(f"problem '{self.name}': rows with constant gradients come first")
         for row, linear in zip(self.rows, constant, strict=True):
             if row.cautious and not row.soft:
-                raise ValueError(f"row '{row.name}' is tightened: give it a penalty")
+                raise ValueError(f"row '{row.name}' is cautious: give it a penalty")
             if not (row.soft or linear):
                 # The line search weighs defects and soft rows alone.
                 raise ValueError(f"row '{row.name}' is not linear: give it a penalty")

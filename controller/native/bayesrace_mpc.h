@@ -91,8 +91,8 @@ typedef enum {
     REAL(defect_max)       /* largest dynamics defect of a usable plan; above 0 */          \
     REAL(early_stop_tol)   /* a step ends at this stationarity and a tenth of it as defect, \
                             * or earlier: see br_step.c */                                  \
-    REAL(caution_sigmas)   /* standard deviations of the residual by which rows are         \
-                            * tightened; 0: none */                                         \
+    REAL(caution_sigmas)   /* standard deviations of the residual that a plan's tube is     \
+                            * wide to either side; 0: no caution */                         \
     WHOLE(iterations)      /* SQP iterations a step without budget may use, once the defect \
                             * is below 0.01; at least 1 */                                  \
     WHOLE(iterations_cold) /* the same for the first step after a reset; with a budget the  \
@@ -293,9 +293,8 @@ BR_API br_mpc_error br_mpc_step(br_mpc *mpc, const double x[BR_NX], const double
                                 double budget_s, double u[BR_NU], br_mpc_status *status,
                                 br_mpc_info *info);
 
-/* The same with a reference of the caller's own planner, stages 1..BR_N. Caution tightens the track
- * of these stages; how fast they go is the caller's: info->pace says which share of its speed
- * br_mpc_step would ask for. */
+/* The same with a reference of the caller's own planner, stages 1..BR_N. How fast its stages go
+ * is the caller's: info->pace says which share of its speed br_mpc_step would ask for. */
 BR_API br_mpc_error br_mpc_solve(br_mpc *mpc, const double x[BR_NX], const double u_before[BR_NU],
                                  double elapsed_s, double budget_s,
                                  const br_mpc_reference reference[BR_N], double u[BR_NU],
@@ -383,7 +382,7 @@ BR_API br_mpc_error br_mpc_get_speeds(const br_mpc *mpc, double *speeds_mps, int
 #endif
 
 /* How uncertain the last step's plan is: for each stage, half the width that uncertainty takes of
- * the rows that it tightens, the largest [the row's unit]. 0 without caution. */
+ * the cautious rows, the largest [the row's unit]. 0 without caution. */
 BR_API br_mpc_error br_mpc_get_tube(const br_mpc *mpc, double tube[BR_N]);
 
 /* --- for tests and tools --- */

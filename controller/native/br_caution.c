@@ -1,4 +1,4 @@
-/* Caution: soft rows are tightened by what the residual's posterior does not know.
+/* Caution: the car is slowed down by what the residual's posterior does not know.
  *
  * The residual is one unknown function, and a posterior of smooth functions errs in the same
  * direction for as long as the plan stays where it is uncertain. So the errors of a plan's stages
@@ -8,17 +8,21 @@
  *   D_j,k+1 = (A_k - B_k K_k) D_j,k + F_k,j sigma_j(z_k),   D_j,0 = 0
  *
  * F_k,j is what the residual's output does to the states. An estimated state adds deviations of its
- * own that begin with the columns of L, L L' = P its covariance, and add nothing on their way. A
- * row h <= upper becomes h + n |D_k' grad h| <= upper with n standard deviations. (Independent
- * errors would add up to the root of the number of stages only, which is far too little:
- * docs/decisions/2026-11-23-caution.md has the laps.) K is the gain of a linear quadratic regulator
- * about the plan; the problem names the sizes of the deviations that it weighs equally. sigma
- * counts what the mean may err by, without noise, which averages out, and with what is not known of
- * the mismatch (br_mismatch.c).
+ * own that begin with the columns of L, L L' = P its covariance, and add nothing on their way. The
+ * tube of a row h <= upper is n |D_k' grad h| wide to either side, with n standard deviations.
+ * (Independent errors would add up to the root of the number of stages only, which is far too
+ * little: docs/decisions/2026-11-23-caution.md has the laps.) K is the gain of a linear quadratic
+ * regulator about the plan; the problem names the sizes of the deviations that it weighs equally.
+ * sigma counts what the mean may err by, without noise, which averages out, and with what is not
+ * known of the mismatch (br_mismatch.c).
+ *
+ * Where the tube takes too much of the room between the bounds, the reference slows down. The
+ * bounds themselves stay where they are: a plan that is pushed by them does what is known even
+ * less, and its tube is wider (docs/decisions/2026-11-27-caution-slows.md).
  *
  * As in zero-order robust MPC (Zanelli, Frey, Messerer, Diehl, "Zero-order robust nonlinear model
- * predictive control with ellipsoidal uncertainty sets", 2021) all of this belongs to the plan that
- * the step starts with and is constant in it: it is done in the preparation.
+ * predictive control with ellipsoidal uncertainty sets", 2021) the deviations belong to the plan
+ * that the step starts with and are constant in it: they are made in the preparation.
  */
 #include "br_internal.h"
 
@@ -147,9 +151,7 @@ void br_caution_update(br_mpc *mpc) {
     br_caution *caution = &mpc->caution;
     if (mpc->valid[BR_TUBE]) return;
     mpc->valid[BR_TUBE] = 1;
-    const int was = caution->active;
     caution->active = mpc->parameters.caution_sigmas > 0 && gp->uncertain;
-    if (was || caution->active) br_invalidate(mpc, BR_TERMS);
     mpc->timer.caution = 0;
     caution->widening = 1;
     if (!caution->active) return;
@@ -167,9 +169,8 @@ void br_caution_update(br_mpc *mpc) {
     br_timer_note(&mpc->timer, begin, &mpc->timer.caution);
 }
 
-/* By how much to back off from the bounds of the row with this gradient at the end of stage k: n
- * standard deviations. */
-static double back_off(const br_mpc *mpc, int k, int r, const double *gradient) {
+/* n standard deviations of the row with this gradient at the end of stage k. */
+static double half_tube(const br_mpc *mpc, int k, int r, const double *gradient) {
     double squares = 0;
     for (int j = 0; j < BR_NE + mpc->caution.begins; ++j) {
         double along = 0;
@@ -180,23 +181,23 @@ static double back_off(const br_mpc *mpc, int k, int r, const double *gradient) 
     return mpc->parameters.caution_sigmas * sqrt(squares);
 }
 
-/* Brings the bounds of the stage's rows nearer to each other, at most to a tenth of what they were
- * apart. A row that its penalty switches off leaves nothing to be cautious about. */
-void br_caution_tighten(br_mpc *mpc, int k, br_stage_terms *terms) {
-    br_caution *caution = &mpc->caution;
-    caution->tube[k] = caution->share[k] = 0;
-    if (!caution->active || mpc->turn) return;
-    for (int r = 0; r < BR_NR; ++r) {
-        if (!BR_ROW_CAUTIOUS[r] || !(mpc->qp.penalty[r] > 0)) continue;
-        const double room = 0.5 * (terms->upper[r] - terms->lower[r]);
-        if (!(room > 0)) continue;
-        const double wanted = back_off(mpc, k, r, terms->gradient);
-        const double taken = fmin(wanted, 0.9 * room);
-        terms->lower[r] += taken;
-        terms->upper[r] -= taken;
-        caution->tube[k] = br_worse(caution->tube[k], wanted);
-        caution->share[k] = br_worse(caution->share[k], wanted / room);
-    }
+/* The widest of the rows by stage, of the plan that the step began with. Returns the largest share
+ * that one takes of the room between its bounds. A row that its penalty switches off leaves nothing
+ * to be cautious about. */
+static double measure_tube(const br_mpc *mpc, double tube[BR_N]) {
+    double largest = 0;
+    memset(tube, 0, BR_N * sizeof *tube);
+    if (!mpc->caution.active || mpc->turn) return 0;
+    for (int k = 0; k < BR_N; ++k)
+        for (int r = 0; r < BR_NR; ++r) {
+            const br_stage_terms *terms = &mpc->qp.terms[k];
+            const double room = 0.5 * (terms->upper[r] - terms->lower[r]);
+            if (!BR_ROW_CAUTIOUS[r] || !(mpc->qp.penalty[r] > 0) || !(room > 0)) continue;
+            const double half = half_tube(mpc, k, r, terms->gradient);
+            tube[k] = br_worse(tube[k], half);
+            largest = br_worse(largest, half / room);
+        }
+    return largest;
 }
 
 void br_caution_report(br_mpc *mpc) {
@@ -208,26 +209,36 @@ void br_caution_report(br_mpc *mpc) {
     mpc->info.widening = mpc->caution.widening;
 }
 
+#if BR_HAS_PATH
+/* Rate at which a car on the brake slows down, as a share of its speed [1/s]; not a number where
+ * the model says none. */
+static double braking_rate(const br_mpc *mpc) {
+    const br_gp *gp = &mpc->gp[mpc->gp_in_use];
+    const double speed = fmax(mpc->x0[BR_INDEX_VX], 1e-3);
+    return -br_straight_acceleration(gp, speed, mpc->parameters.d_min) / speed;
+}
+#endif
+
 /* After a step: the speed of the next reference as a share of the line's. It falls where
  * uncertainty takes more than BR_CAUTION_SHARE of the room at a stage, or is not finite, by at most
  * BR_CAUTION_SLOWER per second, and rises elsewhere by at most BR_CAUTION_FASTER, also when nothing
- * is uncertain any more: a reference that leaps ahead spoils the plan. */
+ * is uncertain any more: a reference that leaps ahead spoils the plan. Nor does it fall faster than
+ * a car on the brake, beside what the line itself brakes: where a plan has to be slower than its
+ * brakes allow, it slides. */
 void br_caution_pace(br_mpc *mpc, double elapsed) {
-    br_caution *caution = &mpc->caution;
-    double worst = 0;
+    const double worst = measure_tube(mpc, mpc->answer_tube);
     mpc->info.tube_m = 0;
-    for (int k = 0; k < BR_N; ++k) {
-        worst = br_worse(worst, caution->share[k]);
-        mpc->info.tube_m = br_worse(mpc->info.tube_m, caution->tube[k]);
-    }
-    memcpy(mpc->answer_tube, caution->tube, sizeof mpc->answer_tube);
+    for (int k = 0; k < BR_N; ++k)
+        mpc->info.tube_m = br_worse(mpc->info.tube_m, mpc->answer_tube[k]);
 #if BR_HAS_PATH
     const double excess = worst / BR_CAUTION_SHARE - 1;
     const double rate = excess <= 0 ? BR_CAUTION_FASTER * fmin(-2 * excess, 1)
-                                    : -BR_CAUTION_SLOWER * fmin(excess, 1); /* NaN, too */
-    const double pace = caution->pace * (1 + rate * fmin(elapsed, BR_TS));
-    caution->pace = fmin(fmax(pace, BR_CAUTION_LEAST), 1);
+                                    : -fmin(BR_CAUTION_SLOWER * fmin(excess, 1), /* NaN, too */
+                                            fmax(braking_rate(mpc), 0));
+    const double pace = mpc->caution.pace * (1 + rate * fmin(elapsed, BR_TS));
+    mpc->caution.pace = fmin(fmax(pace, BR_CAUTION_LEAST), 1);
 #else
+    (void)worst;
     (void)elapsed;
 #endif
     br_caution_report(mpc);

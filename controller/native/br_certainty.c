@@ -1,4 +1,4 @@
-/* The line's speeds as far as the weights know the car.
+/* The line's speeds, and plans, as far as the weights know the car.
  *
  * A line is made for what the car can do; a training drive has seen less. A plan looks ahead for a
  * fraction of a second, and where speed and lateral acceleration together were never trained, the
@@ -15,6 +15,8 @@
  * not tell: its feedback is that of a model which is not known there.) Then the speeds before and
  * after are made anew, within what brake and drive can do and the accelerations that the line has
  * itself (Lipp and Boyd, "Minimum-time speed optimisation over a fixed path", 2014).
+ *
+ * Plans are judged by the same distance (see br_step.c).
  */
 #include "br_internal.h"
 
@@ -169,8 +171,7 @@ static void known_speeds(const br_mpc *mpc, const br_gp *gp, int places, place_o
     }
 }
 
-/* Acceleration on a straight by this command. */
-static double straight(const br_gp *gp, double speed, double duty) {
+double br_straight_acceleration(const br_gp *gp, double speed, double duty) {
     double x[BR_NX] = {0}, u[BR_NU] = {0}, next[BR_NX];
     x[BR_INDEX_VX] = speed;
     u[BR_INDEX_DUTY] = duty;
@@ -211,7 +212,8 @@ static void connect(const br_mpc *mpc, const br_gp *gp, double *speed) {
             const double along = sqrt(fmax(grip * grip - across * across, 0));
             const double duty = way > 0 ? mpc->parameters.d_max : mpc->parameters.d_min;
             const double own = way * line_acceleration(path, way > 0 ? i : next, 1);
-            const double able = fmax(fmin(way * straight(gp, v, duty), along), fmax(own, 0));
+            const double able =
+                fmax(fmin(way * br_straight_acceleration(gp, v, duty), along), fmax(own, 0));
             speed[next] = fmin(speed[next], sqrt(v * v + 2 * path->spacing * able));
         }
 }
@@ -248,6 +250,26 @@ void br_limit_speeds(br_mpc *mpc, int buffer) {
             }
     }
     if (limited) connect(mpc, gp, speed);
+}
+
+double br_plan_unknown(br_mpc *mpc, const br_plan *plan) {
+    const br_gp *gp = &mpc->gp[mpc->gp_in_use];
+    double x[BR_N][BR_NX], u[BR_N][BR_NU], variance[BR_N][BR_NE], most = 0;
+    if (!mpc->caution.active || !mpc->caution.wanted) return 0;
+    memcpy(x, plan->x, sizeof x);
+    memcpy(u, plan->u, sizeof u);
+    br_stages_variances(gp, BR_N, x, u, mpc->caution.correlations, variance);
+    for (int k = 0; k < BR_N; ++k) {
+        const double width = mpc->reference[k].upper - mpc->reference[k].lower;
+        double phi[BR_NPHI], sigma[BR_NE];
+        br_mismatch_terms(x[k], u[k], plan->x[k + 1], 1, phi);
+        for (int j = 0; j < BR_NE; ++j)
+            sigma[j] = sqrt(br_worse(0, variance[k][j] - gp->variance[j].noise) +
+                            br_mismatch_variance(mpc, phi, j));
+        most = br_worse(most,
+                        off_line(mpc, x[k][BR_INDEX_VX], sigma) / (BR_CAUTION_SHARE * 0.5 * width));
+    }
+    return most;
 }
 
 #endif

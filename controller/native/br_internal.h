@@ -113,7 +113,7 @@ typedef struct {
     double multiplier[BR_ROWS];
 } br_plan;
 
-/* The best plan so far of the iterations at hand, with its residuals. */
+/* A plan that is kept, with its residuals, such as the best one so far. */
 typedef struct {
     br_plan plan;
     br_mpc_info info;
@@ -173,7 +173,7 @@ typedef struct {
     int renewed;                   /* ... and stages that are linearised with those before */
 } br_mismatch;
 
-/* What the residual's uncertainty does to the plan: see br_caution.c. */
+/* What the residual's uncertainty does to the pace: see br_caution.c. */
 typedef struct {
     int wanted; /* by the parameters: there are rows to be cautious about, and standard deviations
                  */
@@ -184,8 +184,6 @@ typedef struct {
     double begin[BR_NX][BR_NX];
     double deviation[BR_N][BR_NE + BR_NX][BR_NX]; /* of the states at the ends of the stages, by
                                                    * output, then by column of begin */
-    double tube[BR_N];                            /* by how much the rows are uncertain, */
-    double share[BR_N];                           /* as a share of the room that they leave */
     double pace;     /* of the reference, as a share of the line's speed */
     double widening; /* of the last step's standard deviations, the largest */
     BR_ALIGNED double correlations[BR_GP_ROOT][BR_COLUMNS];
@@ -204,7 +202,7 @@ typedef struct {
 /* What is computed from the plan, the weights and a call's arguments, and kept while these stay.
  * The order is such that none is needed for one after it: see br_invalidate. */
 typedef enum {
-    BR_TERMS,    /* qp.terms: of the plan, the reference, u_before, the parameters and the tube */
+    BR_TERMS,    /* qp.terms: of the plan, the reference, u_before and the parameters */
     BR_FOLLOWED, /* reference and first_row: where the plan is on the line, if it follows that */
     BR_FACTORS,  /* qp: g, h, and y, scale, m of the rows before BR_ROW_LATE */
     BR_TUBE,     /* caution: of the plan that the step starts with */
@@ -275,6 +273,8 @@ struct br_mpc {
     br_plan plan;
     br_plan before; /* the plan that the iteration at hand started from */
     br_incumbent incumbent;
+    br_incumbent begun; /* the plan that the iterations began with, ... */
+    br_incumbent once;  /* ... and that after the first of them */
     br_incumbent first; /* the plan that a second start has to beat */
     unsigned starts;    /* second ones in a row */
     unsigned futile;    /* tries in a row since one was better */
@@ -410,11 +410,22 @@ BR_PART double br_path_curvature(const br_path *path, double s);
 /* Speed of the reference at this pace, where the car is, as a share of the line's. */
 BR_PART double br_path_pace(const br_path *path, double pace);
 
-/* --- br_certainty.c: the line's speeds as far as the weights know --- */
+/* --- br_certainty.c: the line's speeds, and plans, as far as the weights know --- */
 
 BR_PART void br_limit_speeds(br_mpc *mpc, int buffer);
 #if BR_HAS_PATH
-BR_PART __typeof__(br_mpc_steer) br_steer;
+/* How far errors as large as the residual's standard deviation take the car from the plan until
+ * feedback notices them, as a share of what they may: BR_CAUTION_SHARE of half the width there; the
+ * most of all stages. 0 without caution. */
+BR_PART double br_plan_unknown(br_mpc *mpc, const br_plan *plan);
+/* Acceleration on a straight by this command. */
+BR_PART double br_straight_acceleration(const br_gp *gp, double speed, double duty);
+BR_PART __typeof__(br_mpc_steer) br_steer; /* br_planner.c */
+#else
+static inline double br_plan_unknown(br_mpc *mpc, const br_plan *plan) {
+    (void)mpc, (void)plan;
+    return 0;
+}
 #endif
 
 /* --- br_mismatch.c: what the corrected model errs by lately --- */
@@ -458,7 +469,6 @@ BR_PART void br_watch_update(br_mpc *mpc); /* in the preparation */
 BR_PART void br_caution_reset(br_caution *caution);
 BR_PART void br_caution_update(br_mpc *mpc);
 BR_PART void br_caution_advance(br_caution *caution);
-BR_PART void br_caution_tighten(br_mpc *mpc, int k, br_stage_terms *terms);
 BR_PART void br_caution_pace(br_mpc *mpc, double elapsed);
 BR_PART void br_caution_report(br_mpc *mpc); /* into mpc->info */
 
@@ -509,7 +519,8 @@ BR_PART br_mpc_status br_sqp_iterate(br_mpc *mpc, int warm, int first_of_warm);
 BR_PART void br_incumbent_reset(br_mpc *mpc);
 BR_PART void br_incumbent_keep(br_mpc *mpc, br_mpc_status status, int lowest);
 BR_PART br_mpc_status br_incumbent_restore(br_mpc *mpc, br_mpc_status status);
-BR_PART void br_first_plan_keep(br_mpc *mpc, br_mpc_status status);
+BR_PART void br_plan_keep(const br_mpc *mpc, br_mpc_status status, br_incumbent *kept);
+BR_PART void br_plan_restore(br_mpc *mpc, const br_incumbent *kept);
 BR_PART br_mpc_status br_first_plan_compare(br_mpc *mpc, br_mpc_status status, int *second);
 
 /* --- br_step.c --- */

@@ -230,11 +230,15 @@ double br_path_pace(const br_path *path, double pace) {
 }
 
 #if BR_FOLLOWS_PLAN
+/* A plan that maximises progress does not drive the line, and its own tube slows it down: what
+ * little is not known of the line's speed does not make it follow that. */
+#define NEARLY_KNOWN 0.95
+
 int br_path_known_ahead(const br_path *path) {
     double s = path->s, row[BR_PATH_COLUMNS];
     for (int k = 0; k < BR_N; ++k) {
         path_at(path, s, row);
-        if (known_speed(path, s) < row[BR_LINE_SPEED]) return 0;
+        if (known_speed(path, s) < NEARLY_KNOWN * row[BR_LINE_SPEED]) return 0;
         s += BR_TS * row[BR_LINE_SPEED];
     }
     return 1;

@@ -23,7 +23,6 @@ void br_evaluate_terms(br_mpc *mpc) {
                 BR_LIST(mpc->plan.x[k + 1], mpc->plan.u[k], input_before(mpc, k), &last, reference,
                         theta),
                 BR_LIST((double *)&mpc->qp.terms[k]));
-        br_caution_tighten(mpc, k, &mpc->qp.terms[k]);
     }
 }
 

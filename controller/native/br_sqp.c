@@ -210,11 +210,18 @@ br_mpc_status br_incumbent_restore(br_mpc *mpc, br_mpc_status status) {
     return br_usable(incumbent->status) ? incumbent->status : status;
 }
 
-/* Keeps the plan at hand as the one that another start has to beat. */
-void br_first_plan_keep(br_mpc *mpc, br_mpc_status status) { note(mpc, &mpc->first, status); }
+/* Keeps the plan at hand, of which the residuals are known, and puts it back. */
+void br_plan_keep(const br_mpc *mpc, br_mpc_status status, br_incumbent *kept) {
+    note(mpc, kept, status);
+}
 
-/* Leaves the better one of that plan and the one at hand: the usable one, or the one of less cost.
- * Returns its status; *second: whether it is the one at hand. */
+void br_plan_restore(br_mpc *mpc, const br_incumbent *kept) {
+    put_back(mpc, kept);
+    br_qp_forget_working_set(&mpc->qp); /* that of the plan that was left */
+}
+
+/* Leaves the better one of the first plan and the one at hand: the usable one, or the one of less
+ * cost. Returns its status; *second: whether it is the one at hand. */
 br_mpc_status br_first_plan_compare(br_mpc *mpc, br_mpc_status status, int *second) {
     const br_incumbent *first = &mpc->first;
     *second = br_usable(status) && (!br_usable(first->status) || mpc->worth < first->worth);

@@ -99,6 +99,7 @@ static br_mpc_status iterate(br_mpc *mpc, int warm, int most) {
             break;
         }
         status = br_sqp_iterate(mpc, i > 0 || warm, i == 0 && warm);
+        if (i == 0) br_plan_keep(mpc, status, &mpc->once);
         br_incumbent_keep(mpc, status, timer->limited);
         if (status != BR_ACCEPTABLE && status != BR_DEFECT) break;
         if (status == BR_ACCEPTABLE && stops_early(mpc, &residual)) break;
@@ -111,11 +112,39 @@ static br_mpc_status iterate(br_mpc *mpc, int warm, int most) {
  * exact Hessian is indefinite, or Newton's steps had to be shortened. Typically the horizon has
  * reached a bend for which the plan is too fast: the tyres slide, and neither more nor less
  * steering helps. Such a plan satisfies every residual and costs more with each step. A plan that
- * maximises progress is always near that, and no sign of anything; nor is one that the preparation
- * has compared with that of another start. */
+ * maximises progress is always near that, which is no sign of anything. */
+static int wanders(const br_mpc *mpc) {
+    return (mpc->qp.regularised || mpc->info.shortened) && !mpc->follows;
+}
+
+/* Nor need another start be tried where the preparation has compared one. */
 static int doubtful(const br_mpc *mpc, br_mpc_status status) {
-    const int sign = (mpc->qp.regularised || mpc->info.shortened) && !mpc->follows && !mpc->looked;
-    return sign || !br_usable(status);
+    return (wanders(mpc) && !mpc->looked) || !br_usable(status);
+}
+
+/* Whether the plan may be driven: it goes no farther into what the weights do not know than the
+ * one before did, or than caution allows. There is one way to turn. */
+static int is_known(br_mpc *mpc, double before) {
+    const double unknown = mpc->turn ? 0 : br_plan_unknown(mpc, &mpc->plan);
+    return unknown <= fmax(before, 1);
+}
+
+/* Another local minimum may be there in the model alone: where nothing was learned, tyres that
+ * slide may pull the car. A plan that leads there is put back to what it was after one iteration,
+ * which is near the plan from before, or else to that, if it begins where the car is to within a
+ * centimetre or so. */
+static br_mpc_status stay_in_the_known(br_mpc *mpc, br_mpc_status status) {
+    const br_incumbent *begun = &mpc->begun, *once = &mpc->once;
+    const br_timer *timer = &mpc->timer;
+    if (!br_timer_allows(timer, br_timer_now(timer), 4 * timer->caution)) return status;
+    if (!br_usable(status) || !br_usable(once->status) || is_known(mpc, 1)) return status;
+    const double before = br_plan_unknown(mpc, &begun->plan);
+    if (is_known(mpc, before)) return status;
+    br_plan_restore(mpc, once);
+    if (!br_usable(begun->status) || begun->info.defect > BR_DEFECT_FINE) return once->status;
+    if (is_known(mpc, before)) return once->status;
+    br_plan_restore(mpc, begun);
+    return begun->status;
 }
 
 /* Whether to try: where nothing has been better for long, as with a model that is wrong all over,
@@ -133,10 +162,14 @@ static br_mpc_status start_again(br_mpc *mpc, br_mpc_status status, unsigned tur
     const int time_limited = mpc->info.time_limited;
     double u[BR_NU];
     int better;
-    br_first_plan_keep(mpc, status);
+    br_plan_keep(mpc, status, &mpc->first);
     br_first_guess(mpc, nothing, shares[turn % 4], u);
     br_sqp_roll_out(mpc, u);
-    status = br_first_plan_compare(mpc, iterate(mpc, 0, BR_SECOND_START_ITERATIONS), &better);
+    status = iterate(mpc, 0, BR_SECOND_START_ITERATIONS);
+    if (br_usable(mpc->first.status) && br_usable(status) && !is_known(mpc, 1) &&
+        !is_known(mpc, br_plan_unknown(mpc, &mpc->first.plan)))
+        status = BR_DEFECT;
+    status = br_first_plan_compare(mpc, status, &better);
     mpc->info.second_start = better ? 2 : 1;
     if (better)
         mpc->futile = mpc->starts = 0;
@@ -188,8 +221,11 @@ static br_mpc_status optimise(br_mpc *mpc) {
     if (!mpc->warm) return start_cold(mpc, timer->limited ? most : mpc->parameters.iterations_cold);
     br_residuals(mpc);
     const double shifted_cost = mpc->info.cost;
+    br_plan_keep(mpc, br_judge(mpc), &mpc->begun);
     br_mpc_status status = iterate(mpc, 1, most);
-    if (!doubtful(mpc, status))
+    const int doubted = doubtful(mpc, status);
+    if (wanders(mpc)) status = stay_in_the_known(mpc, status);
+    if (!doubted)
         mpc->futile = mpc->starts = 0;
     else if (!mpc->info.time_limited &&
              br_timer_allows(timer, br_timer_now(timer), 3 * timer->iteration) && worth_a_try(mpc))
@@ -352,6 +388,8 @@ static int improve(br_mpc *mpc, int shifts) {
     if (shifts) br_caution_update(mpc); /* else it is that of the last step */
     br_residuals(mpc);
     br_mpc_status status = br_judge(mpc);
+    br_plan_keep(mpc, status, &mpc->begun);
+    mpc->once.status = BR_NOT_FINITE;
     br_incumbent_reset(mpc);
     br_incumbent_keep(mpc, status, 1);
     const int limit = iteration_limit(mpc);
@@ -360,10 +398,12 @@ static int improve(br_mpc *mpc, int shifts) {
         time = br_timer_allows(timer, br_timer_now(timer), iteration_and_rest(timer));
         if (!time) break;
         status = br_sqp_iterate(mpc, 1, shifts && mpc->info.iterations == 0);
+        if (mpc->once.status == BR_NOT_FINITE) br_plan_keep(mpc, status, &mpc->once);
         br_incumbent_keep(mpc, status, 1);
     }
     mpc->prepared_iterations += mpc->info.iterations;
-    br_incumbent_restore(mpc, status);
+    status = br_incumbent_restore(mpc, status);
+    if (mpc->info.iterations && wanders(mpc)) stay_in_the_known(mpc, status);
     return time;
 }
 
