@@ -135,8 +135,6 @@ static int is_known(br_mpc *mpc, double before) {
  * centimetre or so. */
 static br_mpc_status stay_in_the_known(br_mpc *mpc, br_mpc_status status) {
     const br_incumbent *begun = &mpc->begun, *once = &mpc->once;
-    const br_timer *timer = &mpc->timer;
-    if (!br_timer_allows(timer, br_timer_now(timer), 4 * timer->caution)) return status;
     if (!br_usable(status) || !br_usable(once->status) || is_known(mpc, 1)) return status;
     const double before = br_plan_unknown(mpc, &begun->plan);
     if (is_known(mpc, before)) return status;
@@ -224,7 +222,7 @@ static br_mpc_status optimise(br_mpc *mpc) {
     br_plan_keep(mpc, br_judge(mpc), &mpc->begun);
     br_mpc_status status = iterate(mpc, 1, most);
     const int doubted = doubtful(mpc, status);
-    if (wanders(mpc)) status = stay_in_the_known(mpc, status);
+    if (wanders(mpc) && !mpc->info.time_limited) status = stay_in_the_known(mpc, status);
     if (!doubted)
         mpc->futile = mpc->starts = 0;
     else if (!mpc->info.time_limited &&
@@ -403,7 +401,7 @@ static int improve(br_mpc *mpc, int shifts) {
     }
     mpc->prepared_iterations += mpc->info.iterations;
     status = br_incumbent_restore(mpc, status);
-    if (mpc->info.iterations && wanders(mpc)) stay_in_the_known(mpc, status);
+    if (time && mpc->info.iterations && wanders(mpc)) stay_in_the_known(mpc, status);
     return time;
 }
 
