@@ -108,7 +108,7 @@ static void standard_deviations(br_mpc *mpc, double sigma[BR_N][BR_NE]) {
     double ratio = 0;
     for (int j = 0; j < BR_NE; ++j)
         for (int i = 0; i < COUNT; ++i) {
-            const double latent = br_worse(0, variance[i][j] - gp->variance[j].noise);
+            const double latent = br_latent(gp, j, variance[i][j]);
             const double mismatch = br_mismatch_variance(mpc, mpc->stage[stage[i]].phi, j);
             sigma[stage[i]][j] = sqrt(latent + mismatch);
             if (variance[i][j] > 0) ratio = br_worse(ratio, mismatch / variance[i][j]);

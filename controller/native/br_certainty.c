@@ -135,8 +135,7 @@ static double off_line(const br_mpc *mpc, double speed, const double sigma[BR_NE
 static void try_slower(const br_mpc *mpc, const br_gp *gp, const double variance[BR_NE],
                        place_on_line *at) {
     double sigma[BR_NE];
-    for (int j = 0; j < BR_NE; ++j)
-        sigma[j] = sqrt(br_worse(0, variance[j] - gp->variance[j].noise));
+    for (int j = 0; j < BR_NE; ++j) sigma[j] = sqrt(br_latent(gp, j, variance[j]));
     const double off = off_line(mpc, at->known, sigma), before = at->off;
     at->off = off;
     at->decided = 1;
@@ -255,7 +254,7 @@ void br_limit_speeds(br_mpc *mpc, int buffer) {
 double br_plan_unknown(br_mpc *mpc, const br_plan *plan) {
     const br_gp *gp = &mpc->gp[mpc->gp_in_use];
     double x[BR_N][BR_NX], u[BR_N][BR_NU], variance[BR_N][BR_NE], most = 0;
-    if (!mpc->caution.active || !mpc->caution.wanted) return 0;
+    if (!mpc->caution.active || !mpc->caution.wanted || mpc->turn) return 0;
     memcpy(x, plan->x, sizeof x);
     memcpy(u, plan->u, sizeof u);
     br_stages_variances(gp, BR_N, x, u, mpc->caution.correlations, variance);
@@ -264,8 +263,7 @@ double br_plan_unknown(br_mpc *mpc, const br_plan *plan) {
         double phi[BR_NPHI], sigma[BR_NE];
         br_mismatch_terms(x[k], u[k], plan->x[k + 1], 1, phi);
         for (int j = 0; j < BR_NE; ++j)
-            sigma[j] = sqrt(br_worse(0, variance[k][j] - gp->variance[j].noise) +
-                            br_mismatch_variance(mpc, phi, j));
+            sigma[j] = sqrt(br_latent(gp, j, variance[k][j]) + br_mismatch_variance(mpc, phi, j));
         most = br_worse(most,
                         off_line(mpc, x[k][BR_INDEX_VX], sigma) / (BR_CAUTION_SHARE * 0.5 * width));
     }

@@ -373,6 +373,10 @@ BR_PART void br_stage_features(const double x[BR_NX], const double u[BR_NU], dou
 BR_PART void br_stages_variances(const br_gp *gp, int stages, double (*x)[BR_NX],
                                  double (*u)[BR_NU], double (*work)[BR_COLUMNS],
                                  double (*variance)[BR_NE]);
+/* What of that is not the output's noise. */
+static inline double br_latent(const br_gp *gp, int output, double variance) {
+    return br_worse(0, variance - gp->variance[output].noise);
+}
 /* gp NULL: without correction. */
 BR_PART void br_stage_advance(const br_gp *gp, const double x[BR_NX], const double u[BR_NU],
                               double duration, double x_next[BR_NX]);
@@ -409,6 +413,9 @@ BR_PART void br_turnaround(br_mpc *mpc);
 BR_PART double br_path_curvature(const br_path *path, double s);
 /* Speed of the reference at this pace, where the car is, as a share of the line's. */
 BR_PART double br_path_pace(const br_path *path, double pace);
+#if BR_HAS_PATH
+BR_PART __typeof__(br_mpc_steer) br_steer;
+#endif
 
 /* --- br_certainty.c: the line's speeds, and plans, as far as the weights know --- */
 
@@ -416,11 +423,10 @@ BR_PART void br_limit_speeds(br_mpc *mpc, int buffer);
 #if BR_HAS_PATH
 /* How far errors as large as the residual's standard deviation take the car from the plan until
  * feedback notices them, as a share of what they may: BR_CAUTION_SHARE of half the width there; the
- * most of all stages. 0 without caution. */
+ * most of all stages. 0 without caution, and for a turn, of which there is one way. */
 BR_PART double br_plan_unknown(br_mpc *mpc, const br_plan *plan);
 /* Acceleration on a straight by this command. */
 BR_PART double br_straight_acceleration(const br_gp *gp, double speed, double duty);
-BR_PART __typeof__(br_mpc_steer) br_steer; /* br_planner.c */
 #else
 static inline double br_plan_unknown(br_mpc *mpc, const br_plan *plan) {
     (void)mpc, (void)plan;

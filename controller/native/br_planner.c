@@ -12,6 +12,10 @@
 
 #if BR_HAS_PATH
 
+/* Share of the line's speed. A plan that maximises progress does not drive the line, and its own
+ * tube slows it down: what little is not known of that speed does not make it follow the line. */
+#define NEARLY_KNOWN 0.95
+
 typedef struct {
     double left_m;    /* of the line */
     double middle_m;  /* of the track, to the left of the line */
@@ -230,10 +234,6 @@ double br_path_pace(const br_path *path, double pace) {
 }
 
 #if BR_FOLLOWS_PLAN
-/* A plan that maximises progress does not drive the line, and its own tube slows it down: what
- * little is not known of the line's speed does not make it follow that. */
-#define NEARLY_KNOWN 0.95
-
 int br_path_known_ahead(const br_path *path) {
     double s = path->s, row[BR_PATH_COLUMNS];
     for (int k = 0; k < BR_N; ++k) {

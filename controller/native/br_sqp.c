@@ -165,15 +165,16 @@ br_mpc_status br_sqp_iterate(br_mpc *mpc, int warm, int first_of_warm) {
     return status;
 }
 
-/* --- the incumbent: the best plan of several iterations, which is returned although a later one
- * fails; and the comparison of the plans from two starts --- */
+/* --- plans that are kept: the incumbent, the best one of several iterations, which is returned
+ * although a later one fails; those of two starts, which are compared; those from before --- */
 
-static void note(const br_mpc *mpc, br_incumbent *incumbent, br_mpc_status status) {
-    incumbent->plan = mpc->plan;
-    incumbent->info = mpc->info;
-    incumbent->status = status;
-    incumbent->residual = br_residual(mpc);
-    incumbent->worth = mpc->worth;
+/* Keeps the plan at hand, whose residuals are in info. */
+void br_plan_keep(const br_mpc *mpc, br_mpc_status status, br_incumbent *kept) {
+    kept->plan = mpc->plan;
+    kept->info = mpc->info;
+    kept->status = status;
+    kept->residual = br_residual(mpc);
+    kept->worth = mpc->worth;
 }
 
 static void put_back(br_mpc *mpc, const br_incumbent *incumbent) {
@@ -198,7 +199,7 @@ void br_incumbent_keep(br_mpc *mpc, br_mpc_status status, int lowest) {
     const int better = status < incumbent->status ||
                        (status == incumbent->status && residual < incumbent->residual);
     if (lowest && !better) return;
-    note(mpc, incumbent, status);
+    br_plan_keep(mpc, status, incumbent);
 }
 
 /* Puts the best plan and its residuals back. Returns its status, or the given one if it is not
@@ -210,11 +211,7 @@ br_mpc_status br_incumbent_restore(br_mpc *mpc, br_mpc_status status) {
     return br_usable(incumbent->status) ? incumbent->status : status;
 }
 
-/* Keeps the plan at hand, of which the residuals are known, and puts it back. */
-void br_plan_keep(const br_mpc *mpc, br_mpc_status status, br_incumbent *kept) {
-    note(mpc, kept, status);
-}
-
+/* Puts back a plan from before the iterations at hand. */
 void br_plan_restore(br_mpc *mpc, const br_incumbent *kept) {
     put_back(mpc, kept);
     br_qp_forget_working_set(&mpc->qp); /* that of the plan that was left */

@@ -99,7 +99,7 @@ static br_mpc_status iterate(br_mpc *mpc, int warm, int most) {
             break;
         }
         status = br_sqp_iterate(mpc, i > 0 || warm, i == 0 && warm);
-        if (i == 0) br_plan_keep(mpc, status, &mpc->once);
+        if (i == 0 && warm) br_plan_keep(mpc, status, &mpc->once);
         br_incumbent_keep(mpc, status, timer->limited);
         if (status != BR_ACCEPTABLE && status != BR_DEFECT) break;
         if (status == BR_ACCEPTABLE && stops_early(mpc, &residual)) break;
@@ -122,11 +122,11 @@ static int doubtful(const br_mpc *mpc, br_mpc_status status) {
     return (wanders(mpc) && !mpc->looked) || !br_usable(status);
 }
 
-/* Whether the plan may be driven: it goes no farther into what the weights do not know than the
- * one before did, or than caution allows. There is one way to turn. */
-static int is_known(br_mpc *mpc, double before) {
-    const double unknown = mpc->turn ? 0 : br_plan_unknown(mpc, &mpc->plan);
-    return unknown <= fmax(before, 1);
+/* Whether the plan may be driven: it goes no farther into what the weights do not know than caution
+ * allows, or than the one before did. */
+static int is_known(br_mpc *mpc, const br_plan *before) {
+    const double unknown = br_plan_unknown(mpc, &mpc->plan);
+    return unknown <= 1 || unknown <= br_plan_unknown(mpc, before);
 }
 
 /* Another local minimum may be there in the model alone: where nothing was learned, tyres that
@@ -135,12 +135,11 @@ static int is_known(br_mpc *mpc, double before) {
  * centimetre or so. */
 static br_mpc_status stay_in_the_known(br_mpc *mpc, br_mpc_status status) {
     const br_incumbent *begun = &mpc->begun, *once = &mpc->once;
-    if (!br_usable(status) || !br_usable(once->status) || is_known(mpc, 1)) return status;
-    const double before = br_plan_unknown(mpc, &begun->plan);
-    if (is_known(mpc, before)) return status;
+    if (!br_usable(status) || !br_usable(once->status)) return status;
+    if (is_known(mpc, &begun->plan)) return status;
     br_plan_restore(mpc, once);
     if (!br_usable(begun->status) || begun->info.defect > BR_DEFECT_FINE) return once->status;
-    if (is_known(mpc, before)) return once->status;
+    if (is_known(mpc, &begun->plan)) return once->status;
     br_plan_restore(mpc, begun);
     return begun->status;
 }
@@ -164,8 +163,7 @@ static br_mpc_status start_again(br_mpc *mpc, br_mpc_status status, unsigned tur
     br_first_guess(mpc, nothing, shares[turn % 4], u);
     br_sqp_roll_out(mpc, u);
     status = iterate(mpc, 0, BR_SECOND_START_ITERATIONS);
-    if (br_usable(mpc->first.status) && br_usable(status) && !is_known(mpc, 1) &&
-        !is_known(mpc, br_plan_unknown(mpc, &mpc->first.plan)))
+    if (br_usable(mpc->first.status) && br_usable(status) && !is_known(mpc, &mpc->first.plan))
         status = BR_DEFECT;
     status = br_first_plan_compare(mpc, status, &better);
     mpc->info.second_start = better ? 2 : 1;
