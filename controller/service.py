@@ -223,6 +223,7 @@ class Service:
             "holds_lost": self._holds_lost,
             "raised": driver.count("failed"),
             "second_starts": driver.count("second_starts"),
+            "creeping": driver.count("creeping"),
             "cost_jumps": driver.count("cost_jumps"),
             **{f"sensor_{name}": count for name, count in driver.faults.items() if count},
             **{

@@ -33,7 +33,6 @@ from bayesrace.operation.drive import RunPlan
 from bayesrace.operation.preparation import (
     PredictionModel,
     Prepared,
-    PreparedTrack,
     prepare,
     progress_artefact,
     updated_weights,
@@ -41,6 +40,7 @@ from bayesrace.operation.preparation import (
 from bayesrace.operation.settings import RaceSettings
 from bayesrace.operation.system import Child, System, child, started_system
 from bayesrace.operation.terminal.terminal import Stages
+from bayesrace.operation.training_drives import PreparedTrack
 from bayesrace.plant.simulator import PLANT
 from bayesrace.plant.vehicle import FmuFault, open_vehicle
 from bayesrace.plant.world import write_world
@@ -166,9 +166,11 @@ def _prepared(settings: RaceSettings, out: Path, stages: Stages) -> Prepared:
     if prepared.training is not None:
         _kept(prepared.training.driven_on, out, "train")
         shutil.copyfile(prepared.training.log, out / "collect.mcap")
-    if prepared.practice is not None:
-        _kept(prepared.practice.driven_on, out, "practice")
-        shutil.copyfile(prepared.practice.log, out / "practice.mcap")
+    for number, practice in enumerate(prepared.practices):
+        size = practice.driven_on.track.name.rpartition("-")[2] if number else ""
+        label = f"practice-{size}" if size else "practice"
+        _kept(practice.driven_on, out, label)
+        shutil.copyfile(practice.log, out / f"{label}.mcap")
     for model, folder in zip(models, prepared.artefacts, strict=True):
         shutil.copyfile(folder / MANIFEST, out / f"manifest-{model}.json")
     weights = Path(shutil.copyfile(prepared.weights, out / "weights-bayesrace.bin"))

@@ -218,7 +218,9 @@ def fast_race(folder: Path, practice_laps: int) -> tuple[Prepared, RaceSettings]
     x, y, right, left = (10 / 43 * rows[::-1]).T
     track = Track.from_points("fast", np.column_stack([x, y]), left, right)
     write_track(folder / "fast.csv", track)
-    settings = RaceSettings(track=str(folder / "fast.csv"), practice_laps=practice_laps)
+    settings = RaceSettings(
+        track=str(folder / "fast.csv"), practice_laps=practice_laps, coverage=0.0
+    )
     with stages_on(Console(quiet=True)) as stages:
         return prepare(settings, (settings.track,), stages), settings
 

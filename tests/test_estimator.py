@@ -20,8 +20,8 @@ from bayesrace.gp.expression import mean_function
 from bayesrace.gp.weights import GpWeights
 from bayesrace.integrators import PREDICTION
 from bayesrace.operation.closed_loop import ClosedLoop
-from bayesrace.operation.preparation import drive_for_training
 from bayesrace.operation.settings import PreparationSettings
+from bayesrace.operation.training_drives import drive_for_training
 from bayesrace.raceline import compute_raceline
 from bayesrace.sensors import Sensors, get_sensors
 from bayesrace.tracks import load_track

@@ -61,8 +61,8 @@ def preparing(
 
 STAGES = [
     "racing line, random",
-    "training line, random",
     "build the controllers",
+    "training line, random",
     "training drive (pure pursuit)",
     "train the residual",
 ]
@@ -78,7 +78,7 @@ def test_a_second_preparation_computes_nothing_and_says_so(
         raise AssertionError("computed again")
 
     for name in (
-        "bayesrace.raceline.compute_raceline", "bayesrace.operation.preparation.collect",
+        "bayesrace.raceline.compute_raceline", "bayesrace.operation.training_drives.collect",
         "bayesrace.learning.training.train",
     ):  # fmt: skip
         monkeypatch.setattr(name, never)
@@ -141,9 +141,8 @@ def test_the_controller_learns_from_its_own_laps_of_the_training_track(
 
     monkeypatch.setattr("bayesrace.learning.training.train", train)
     prepared, _ = preparing(practice_laps=1)
-    training, practice = prepared.training, prepared.practice
+    training, (practice,) = prepared.training, prepared.practices
     assert training is not None
-    assert practice is not None
     (driven, none), (samples, begun_with) = learned
     assert none is None
     assert begun_with is not None
@@ -157,7 +156,7 @@ def test_the_controller_learns_from_its_own_laps_of_the_training_track(
     assert again.weights == prepared.weights
     assert len(learned) == 2
     without, _ = preparing(practice_laps=0)
-    assert without.practice is None
+    assert not without.practices
     assert without.training is not None
     assert without.training.log == training.log
 
@@ -169,8 +168,7 @@ def test_practice_is_kept_for_all_that_shapes_it(
 
     def practise(**changes: object) -> None:
         prepared, _ = preparing(**{"practice_laps": 1} | changes)
-        assert prepared.practice is not None
-        logs.add(prepared.practice.log)
+        logs.add(prepared.practices[0].log)
 
     for changes in ({}, {"practice_laps": 2}, {"start_speed_mps": 0.2}):
         practise(**changes)
@@ -188,7 +186,7 @@ def test_practice_that_says_nothing_is_left_out(
 
     monkeypatch.setattr("bayesrace.operation.collect._until_it_fails", at_once)
     prepared, _ = preparing(practice_laps=1)
-    assert prepared.practice is None
+    assert not prepared.practices
     assert prepared.training is not None
     assert prepared.samples == [prepared.training.samples]
     assert "the practice on random:2 is left out: no two states follow one another" in caplog.text

@@ -253,19 +253,18 @@ def test_a_race_reports_its_training_drive(
     page = write_report(run).read_text()
     assert said in page
     section = page.split('<section id="training">')[1].split("</section>")[0]
-    assert section.count("<svg ") == 1  # the map
+    assert section.count("<svg ") == 2  # the map, and what was covered
     for name in ("train.csv", "train_raceline.csv"):
         shutil.copyfile(run / name, run / name.replace("train", "practice"))
     shutil.copyfile(driven["calm"][1], run / "practice.mcap")
     practised = analyse(run)
     assert practised.training == training
-    assert practised.practice is not None
-    assert practised.practice.lap_times_s == list(driven["calm"][0].laps_s)
+    assert practised.practices["paddock"].lap_times_s == list(driven["calm"][0].laps_s)
     print_table(practised, Console(file=text, width=200))
     assert f"practice on paddock: laps {driven['calm'][0].laps_s[0]:.3f}" in text.getvalue()
     page = write_report(run).read_text()
     section = page.split('<section id="training">')[1].split("</section>")[0]
-    assert section.count("<svg ") == 2
+    assert section.count("<svg ") == 3
 
 
 @pytest.mark.check

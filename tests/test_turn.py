@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 from bayesrace.arrays import Floats
+from bayesrace.codegen.build import build
+from bayesrace.codegen.settings import BuildSettings, ProblemName
 from bayesrace.controller.assembly import make_path_table
 from bayesrace.controller.interface import Environment
 from bayesrace.controller.native_step import NativeStep
@@ -13,6 +15,9 @@ from bayesrace.tracks import Track
 from bayesrace.vehicles import CarParameters, default_car
 from tests.conftest import SETTINGS, Circuit, offset_line
 from tests.test_driver import Rig
+
+HOPELESS = SETTINGS.model_copy(update={"iterations_cold": 1, "defect_max": 1e-12})
+"""Iterations that lead to no plan which may be driven."""
 
 
 def standing(
@@ -156,9 +161,8 @@ def test_what_has_failed_is_begun_otherwise_at_once(
     native: NativeStep, circuit: Circuit, car: CarParameters
 ) -> None:
     """The same cold start over and over would fail for ever where the state does not change."""
-    hopeless = SETTINGS.model_copy(update={"iterations_cold": 1, "defect_max": 1e-12})
-    native.set_parameters(car, hopeless)
-    x = standing(circuit, 1.0, 0.0, 0.0)
+    native.set_parameters(car, HOPELESS)
+    x = circuit.start(1.0, 1.0)
     plans = []
     for _ in range(2):
         assert not native.step(x, 0.0).usable
@@ -167,8 +171,54 @@ def test_what_has_failed_is_begun_otherwise_at_once(
     native.set_parameters(car, SETTINGS)
     assert native.step(x, 0.0).usable
     native.reset()
-    native.set_parameters(car, hopeless)
+    native.set_parameters(car, HOPELESS)
     native.step(x, 0.0)
     plans.append(native.read_plan()[1].copy())
     np.testing.assert_array_equal(plans[0], plans[1])
     np.testing.assert_array_equal(plans[0], plans[2])
+
+
+@pytest.mark.parametrize("problem", ["tracking", "progress"])
+def test_a_standing_car_creeps_along_its_line_where_no_optimisation_finds_a_plan(
+    circuit: Circuit, car: CarParameters, problem: ProblemName
+) -> None:
+    """Each cycle has the same problem: one start of 250 stood for ever."""
+    step = NativeStep(build(BuildSettings(car=car, problem=problem))[0], car, HOPELESS)
+    step.set_path(circuit.table)
+    rig = rig_at(step, circuit, standing(circuit, 1.0, 0.02, 0.3))
+    drive(rig, 40)
+    crept = rig.driver.count("creeping")
+    assert crept >= 1  # between, the fallback drives on by that plan
+    assert rig.x[3] > 0.2
+    assert 0.05 < (where(rig) - 1.0) % circuit.line.length_m < 1.5
+    assert circuit.track.project_points(rig.x[None, :2]).off_track_m.max() < -0.1
+    step.reset()
+    rig.x[3] = 1.0
+    rig.cycle()  # a car that rolls is braked by the fallback
+    assert rig.driver.count("creeping") == crept
+    step.set_parameters(car, SETTINGS)
+    drive(rig, 50)
+    assert rig.x[3] > 1.0
+    assert rig.driver.count("creeping") == crept
+
+
+def test_a_car_that_stands_for_long_creeps_off_unless_it_has_to_stop(
+    native: NativeStep, circuit: Circuit
+) -> None:
+    """The best plan may be to stay, or to drive off later, in each cycle anew."""
+    x = standing(circuit, 1.0, 0.02, 0.1)
+    stop = Environment(speed_limit_mps=0.0, speed_limit_rate_mps2=0.0)
+    for environment, creeps in (stop, False), (None, True):
+        native.reset()
+        native.step(x, 0.0, environment=environment)
+        kinds = []
+        for _ in range(40):  # whatever it does, the car does not move
+            assert native.step(x, 0.0, environment=environment, elapsed_s=0.02).usable
+            kinds.append(native.info.second_start)
+        assert (3 in kinds) == creeps
+    assert kinds.index(3) == pytest.approx(24, abs=1)
+    assert set(kinds[kinds.index(3) :]) == {3}
+    assert 0.5 < native.read_plan()[0][-1, 3] / default_car().tuning.turn.pace_mps < 1.1
+    x[3] = 0.3  # it rolls
+    native.step(x, 0.0, elapsed_s=0.02)
+    assert native.info.second_start != 3

@@ -273,9 +273,9 @@ class Telemetry(Message, frozen=True, kw_only=True, tag=6):
     cost_shifted: Measure
     """Objective of the shifted previous plan for the same state and reference; a plan that costs
     much more has jumped to another local minimum."""
-    second_start: Annotated[int, Meta(ge=0, le=2)]
+    second_start: Annotated[int, Meta(ge=0, le=3)]
     """1: the previous plan was doubtful, and a second start gave no better one; 2: the plan of the
-    second start is used."""
+    second start is used; 3: no start has led to a plan, and the slow car creeps along its line."""
     s_ref_m: Number
     """Arc length of the reference point on the racing line."""
     n_ref_m: Number

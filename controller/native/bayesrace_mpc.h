@@ -106,6 +106,8 @@ typedef struct {
     BR_SOLVER_FIELDS(BR_REAL_MEMBER, BR_WHOLE_MEMBER)
 } br_mpc_parameters;
 
+enum { BR_CREEPS = 3 }; /* of br_mpc_info.second_start */
+
 /* What a step reports. */
 typedef struct {
     int status;              /* br_mpc_status */
@@ -114,7 +116,8 @@ typedef struct {
     int regularised;         /* iterations whose Hessian had to be made positive definite */
     int shortened;           /* steps that the line search halved */
     int second_start;        /* 1: the plan from before was doubtful, and a new one no better;
-                              * 2: the new one is better */
+                              * 2: the new one is better; BR_CREEPS: no start has led to a plan,
+                              * and the slow car creeps along its line */
     int shifts;              /* stages by which the plan was shifted; -1: there was no plan */
     int prepared;            /* 1: br_mpc_prepare had linearised and factorised already */
     int prepared_iterations; /* SQP iterations of br_mpc_prepare since the step before */

@@ -411,6 +411,7 @@ static void count(br_cycle *cycle, int status) {
     const br_solution *solution = &cycle->solution;
     cycle->counters.failed += status == BR_STEP_FAILED;
     cycle->counters.second_starts += solution->second_start > 0;
+    cycle->counters.creeping += solution->second_start == BR_CREEPS;
     if (solution->shifted_cost >= 0)
         cycle->counters.cost_jumps += solution->cost > JUMP * solution->shifted_cost + JUMP_BY;
 }

@@ -259,7 +259,9 @@ struct br_mpc {
     int follows;   /* the reference is where the plan is on the line, not points to track; ... */
     int first_row; /* ... the plan's first stage is at this row of the path */
     double turn;   /* the side that the car turns round to, 1 left, -1 right; 0: it does not */
-    double turn_u[BR_N][BR_NU]; /* inputs that the reference of a turn has been made with */
+    double stood;  /* for so long, although it may drive */
+    int stuck;     /* too long: it is to creep until it rolls */
+    double led_u[BR_N][BR_NU]; /* inputs that lead the car round, or creeping along its line */
     /* the plan, primal and dual */
     int warm;               /* a plan from the step before is there */
     char valid[BR_RESULTS]; /* by br_result */
@@ -410,6 +412,10 @@ BR_PART int br_path_known_ahead(const br_path *path);
 static inline void br_path_follow(br_mpc *mpc) { (void)mpc; }
 #endif
 BR_PART void br_turnaround(br_mpc *mpc);
+/* Whether a car as slow as this may creep; the inputs that lead it along its line. */
+BR_PART int br_creep(br_mpc *mpc);
+/* Notes whether the car stands although it may drive, and is to creep off. */
+BR_PART void br_note_standing(br_mpc *mpc);
 BR_PART double br_path_curvature(const br_path *path, double s);
 /* Speed of the reference at this pace, where the car is, as a share of the line's. */
 BR_PART double br_path_pace(const br_path *path, double pace);
@@ -519,6 +525,7 @@ BR_PART void br_qp_forget_working_set(br_qp *qp);
 /* --- br_sqp.c: the plan's start, shift and iteration; the best plan of several iterations --- */
 
 BR_PART void br_sqp_cold_start(br_mpc *mpc);
+/* The plan that holds this input, or is led: on a turn, or with NULL. */
 BR_PART void br_sqp_roll_out(br_mpc *mpc, const double u[BR_NU]);
 BR_PART void br_sqp_shift(br_mpc *mpc);
 BR_PART br_mpc_status br_sqp_iterate(br_mpc *mpc, int warm, int first_of_warm);

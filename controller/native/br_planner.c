@@ -366,6 +366,9 @@ br_mpc_error br_steer(const br_mpc *mpc, const double x[BR_NX], double *s_m, dou
  * the other way. */
 #define BEGIN_RAD (BR_FOLLOWS_PLAN ? BR_TURN_BEHIND_RAD : BR_TURN_AWAY_RAD)
 
+/* No car stands for so long on purpose. */
+#define STUCK_S 0.5
+
 /* Angle to the point, seen from the car; positive left. */
 static double bearing(const double x[BR_NX], const double to[2]) {
     return remainder(atan2(to[1] - x[BR_INDEX_Y], to[0] - x[BR_INDEX_X]) - x[BR_INDEX_PSI],
@@ -399,6 +402,14 @@ static double bearing_on_line(const br_path *path, const double to[2]) {
     return bearing(here, to);
 }
 
+/* Whether the target is far to one side, farther than for a car on the line; for one that has stood
+ * for long, farther than where it would drive on. */
+static int to_one_side(const br_mpc *mpc, double away, const double target[2]) {
+    if (fabs(away) > BR_TURN_FACED_RAD && mpc->stood > STUCK_S) return 1;
+    const double usual = bearing_on_line(&mpc->path, target);
+    return fabs(away) > BEGIN_RAD && fabs(remainder(away - usual, 2 * M_PI)) > BEGIN_RAD;
+}
+
 /* Begins, goes on with and ends a turn, of a slow or turning car. */
 static void decide(br_mpc *mpc, const double target[2]) {
     const double *x = mpc->x0, away = bearing(x, target), speed = fabs(x[BR_INDEX_VX]);
@@ -406,32 +417,63 @@ static void decide(br_mpc *mpc, const double target[2]) {
         mpc->turn = 0;
     } else if (mpc->turn) {
         if (remaining(mpc->turn, away) < BR_TURN_FACED_RAD) mpc->turn = 0;
-    } else if (fabs(away) > BEGIN_RAD &&
-               fabs(remainder(away - bearing_on_line(&mpc->path, target), 2 * M_PI)) > BEGIN_RAD) {
+    } else if (to_one_side(mpc, away, target)) {
         mpc->turn = side(x, away, &mpc->reference[0]);
         mpc->warm = 0;
     }
 }
 
+static double walking_pace(const br_mpc *mpc) {
+    return fmin(BR_TURN_PACE_MPS, mpc->path.speed_limit);
+}
+
+/* The input of a stage that steers to an angle at a walking pace, and where it leads. */
+static void lead(br_mpc *mpc, int k, double angle, double x[BR_NX]) {
+    const br_mpc_parameters *p = &mpc->parameters;
+    const double steering = fmax(fmin(angle, p->delta_max_rad), -p->delta_max_rad);
+    const double rate = (steering - x[BR_INDEX_DELTA]) / BR_TS;
+    const double throttle = BR_TURN_THROTTLE_SPM * (walking_pace(mpc) - x[BR_INDEX_VX]);
+    double *u = mpc->led_u[k], next[BR_NX];
+    u[BR_INDEX_DUTY] = fmin(fmax(throttle, 0), p->d_max);
+    u[BR_INDEX_DELTA_RATE] = fmin(fmax(rate, -p->delta_rate_max_radps), p->delta_rate_max_radps);
+    br_stage_advance(&mpc->gp[mpc->gp_in_use], x, u, BR_TS, next);
+    memcpy(x, next, sizeof next);
+}
+
+/* A standing car has the same problem in each cycle. If no optimisation finds a plan, or the best
+ * one is to stay, to drive off later, or backwards, it would stand for ever: so it creeps, steered
+ * as the braking plan is. */
+int br_creep(br_mpc *mpc) {
+    double x[BR_NX], s_m = -1, angle = 0, outside_m;
+    if (!mpc->path.ready || mpc->own_reference || mpc->turn) return 0;
+    if (mpc->x0[BR_INDEX_VX] >= walking_pace(mpc)) return 0;
+    memcpy(x, mpc->x0, sizeof x);
+    for (int k = 0; k < BR_N; ++k) {
+        if (br_steer(mpc, x, &s_m, &angle, &outside_m)) return 0;
+        lead(mpc, k, angle, x);
+    }
+    return 1;
+}
+
+void br_note_standing(br_mpc *mpc) {
+    const double speed = mpc->x0[BR_INDEX_VX];
+    const int may_drive = mpc->path.speed_limit >= BR_TURN_STOP_MPS;
+    if (may_drive && fabs(speed) < BR_TURN_STOP_MPS)
+        mpc->stood += fmin(mpc->elapsed, BR_TS);
+    else
+        mpc->stood = 0;
+    mpc->stuck = mpc->stood > STUCK_S || (mpc->stuck && may_drive && speed < walking_pace(mpc) / 2);
+}
+
 void br_turnaround(br_mpc *mpc) {
-    double target[2], x[BR_NX], next[BR_NX];
+    double target[2], x[BR_NX];
     if (!mpc->turn && fabs(mpc->x0[BR_INDEX_VX]) >= BR_TURN_SLOW_MPS) return;
     path_ahead(&mpc->path, BR_TURN_AHEAD_M, target);
     decide(mpc, target);
     if (!mpc->turn) return;
-    const br_mpc_parameters *p = &mpc->parameters;
-    const double pace = fmin(BR_TURN_PACE_MPS, mpc->path.speed_limit);
     memcpy(x, mpc->x0, sizeof x);
     for (int k = 0; k < BR_N; ++k) {
-        const double angle = remaining(mpc->turn, bearing(x, target));
-        const double steering = mpc->turn * fmax(fmin(angle, p->delta_max_rad), -p->delta_max_rad);
-        const double rate = (steering - x[BR_INDEX_DELTA]) / BR_TS;
-        double *u = mpc->turn_u[k];
-        u[BR_INDEX_DUTY] = fmin(fmax(BR_TURN_THROTTLE_SPM * (pace - x[BR_INDEX_VX]), 0), p->d_max);
-        u[BR_INDEX_DELTA_RATE] =
-            fmin(fmax(rate, -p->delta_rate_max_radps), p->delta_rate_max_radps);
-        br_stage_advance(&mpc->gp[mpc->gp_in_use], x, u, BR_TS, next);
-        memcpy(x, next, sizeof x);
+        lead(mpc, k, mpc->turn * remaining(mpc->turn, bearing(x, target)), x);
         br_mpc_reference *reference = &mpc->reference[k];
         reference->x = x[BR_INDEX_X];
         reference->y = x[BR_INDEX_Y];

@@ -18,13 +18,12 @@ void br_sqp_cold_start(br_mpc *mpc) {
     br_sqp_roll_out(mpc, u);
 }
 
-/* The plan that holds this input, or turns. */
 void br_sqp_roll_out(br_mpc *mpc, const double u[BR_NU]) {
     memcpy(mpc->plan.x[0], mpc->x0, sizeof mpc->x0);
     memset(mpc->plan.costate, 0, sizeof mpc->plan.costate);
     memset(mpc->plan.multiplier, 0, sizeof mpc->plan.multiplier);
     for (int k = 0; k < BR_N; ++k) {
-        memcpy(mpc->plan.u[k], mpc->turn ? mpc->turn_u[k] : u, sizeof mpc->plan.u[k]);
+        memcpy(mpc->plan.u[k], mpc->turn || !u ? mpc->led_u[k] : u, sizeof mpc->plan.u[k]);
         br_linearise_stages(mpc, k, 1, k);
         memcpy(mpc->plan.x[k + 1], mpc->stage[k].f, sizeof mpc->plan.x[k + 1]);
     }

@@ -47,6 +47,18 @@ static void align(br_mpc *mpc, int shifts) {
     if (!mpc->valid[BR_LINEARISATION]) br_linearise_plan(mpc);
 }
 
+/* The plan of a slow car that creeps, kept for when no other is found. */
+static void keep_creeping(br_mpc *mpc) {
+    mpc->begun.status = BR_NOT_FINITE;
+#if BR_HAS_PATH
+    if (!br_creep(mpc)) return;
+    br_sqp_roll_out(mpc, NULL);
+    br_path_follow(mpc);
+    br_residuals(mpc);
+    br_plan_keep(mpc, br_judge(mpc), &mpc->begun);
+#endif
+}
+
 /* The plan at the time of the measured state. Without one, or with one that is older than the
  * horizon or has not become usable in as many iterations as a cold start may take, a new one. */
 static void begin_plan(br_mpc *mpc) {
@@ -55,6 +67,7 @@ static void begin_plan(br_mpc *mpc) {
         mpc->info.shifts = shifts_due(&mpc->lag);
         align(mpc, mpc->info.shifts);
     } else {
+        keep_creeping(mpc);
         br_sqp_cold_start(mpc);
         br_invalidate(mpc, BR_TUBE);
         mpc->lag = mpc->unfinished = 0;
@@ -209,12 +222,26 @@ static br_mpc_status start_cold(br_mpc *mpc, int most) {
     return start_without_soft_rows(mpc, most);
 }
 
+/* Creeps if no start has led to a usable plan, and time to go on with one has not helped for some
+ * steps. */
+static br_mpc_status or_creep(br_mpc *mpc, br_mpc_status status) {
+    const int waits = status == BR_TIME_LIMIT && mpc->attempts < 2 * BR_COLD_GUESSES;
+    if (br_usable(status) || waits || !br_usable(mpc->begun.status)) return status;
+    br_plan_restore(mpc, &mpc->begun);
+    mpc->info.second_start = BR_CREEPS;
+    return mpc->begun.status;
+}
+
 static br_mpc_status optimise(br_mpc *mpc) {
     br_timer *timer = &mpc->timer;
     begin_plan(mpc);
     timer->iteration = timer->trial = 0; /* a stall must not be remembered for ever */
     const int most = iteration_limit(mpc);
-    if (!mpc->warm) return start_cold(mpc, timer->limited ? most : mpc->parameters.iterations_cold);
+    if (!mpc->warm) {
+        const int limit = timer->limited ? most : mpc->parameters.iterations_cold;
+        const int creeps = mpc->stuck && br_usable(mpc->begun.status);
+        return or_creep(mpc, creeps ? BR_DEFECT : start_cold(mpc, limit));
+    }
     br_residuals(mpc);
     const double shifted_cost = mpc->info.cost;
     br_plan_keep(mpc, br_judge(mpc), &mpc->begun);
@@ -296,6 +323,7 @@ static int take_environment(br_mpc *mpc, const br_environment *environment) {
 /* Points to track. Where the problem takes its reference from the plan instead, only a stop and a
  * turn need them, and a slow car, which a turn may begin with. */
 static void plan_reference(br_mpc *mpc) {
+    br_note_standing(mpc);
 #if BR_FOLLOWS_PLAN
     const int follows = !isfinite(mpc->path.speed_limit) && mpc->caution.pace >= 1 &&
                         br_path_known_ahead(&mpc->path);
@@ -307,6 +335,7 @@ static void plan_reference(br_mpc *mpc) {
     br_path_plan(&mpc->path, mpc->caution.pace, mpc->reference);
     br_turnaround(mpc);
     if (mpc->turn) mpc->follows = 0;
+    if (mpc->stuck) mpc->warm = 0;
 }
 #endif
 

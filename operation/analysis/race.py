@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import read_weights
+from bayesrace.learning.coverage import Coverage, coverage
 from bayesrace.learning.dataset import Dataset
 from bayesrace.learning.sources import dataset_from_columns
 from bayesrace.learning.validation import Validation, validate
@@ -224,9 +225,18 @@ class RaceAnalysis:
         return _training_run(self.recording.training)
 
     @cached_property
-    def practice(self) -> DrivenRun | None:
-        """The controller's own laps after the training drives, all of them; None without."""
-        return _training_run(self.recording.practice)
+    def practices(self) -> dict[str, DrivenRun]:
+        """Track → the controller's own laps of it after the training drives, all of them."""
+        return {
+            one.track.name: DrivenRun(one.run, one.track, one.line, whole=True)
+            for one in self.recording.practices
+        }
+
+    @cached_property
+    def coverage(self) -> Coverage | None:
+        """How much of the racing line was driven in training and practice; None without these."""
+        found = [one.run.x for one in (self.recording.training, *self.recording.practices) if one]
+        return coverage([self.line], np.vstack(found)) if found else None
 
     @cached_property
     def best_case(self) -> Dataset | None:
@@ -267,7 +277,8 @@ class RaceAnalysis:
             laps=[run.result(recording.settings.laps, limit_s) for run in self.runs],
             limit_s=limit_s,
             training=None if self.training is None else self.training.result(),
-            practice=None if self.practice is None else self.practice.result(practised),
+            practices={on: run.result(practised) for on, run in self.practices.items()},
+            coverage=None if self.coverage is None else self.coverage.share,
             gp=metrics.get("bayesrace", {}),
             gp_updated=metrics.get("bayesrace-updated", {}),
             real_time_factor=_real_time_factor(recording.runs),

@@ -214,8 +214,9 @@ class Recording:
     """A log ends without its end mark, or that of a training drive cannot be read."""
     training: "TrainingRecord | None"
     """The training drive; None where weights were given, or it cannot be read."""
-    practice: "TrainingRecord | None"
-    """The controller's own laps after it; None where there are none, or they cannot be read."""
+    practices: "list[TrainingRecord]"
+    """The controller's own laps after it, of the same track and of larger copies of it; those that
+    can be read."""
     refused: int
     """Messages of the log that could not be decoded."""
     started_ns: int | None
@@ -242,18 +243,20 @@ def read_recording(run_dir: Path, log: LogColumns | None = None) -> Recording:
     firsts = [log[topic]["wall_ns"][:1] for topic in RUN_COLUMNS]
     runs, truth = _planned(log)
     training, whole = _read_training(run_dir, settings, "collect.mcap", "train")
-    practice, practice_whole = _read_training(run_dir, settings, "practice.mcap", "practice")
+    logs = sorted(run_dir.glob("practice*.mcap"), key=lambda path: path.stem)
+    practised = [_read_training(run_dir, settings, path.name, path.stem) for path in logs]
     return Recording(
         directory=run_dir, settings=settings, track=track, line=line, runs=runs, truth=truth,
-        training=training, practice=practice,
-        truncated=log.reader.truncated or not (whole and practice_whole),
+        training=training, practices=[one for one, _ in practised if one is not None],
+        truncated=log.reader.truncated or not all([whole, *(one for _, one in practised)]),
         refused=log.reader.refused, started_ns=min(map(int, np.concatenate(firsts)), default=None),
     )  # fmt: skip
 
 
-def _driven_on(run_dir: Path, setting: str, label: str) -> tuple[Track, RaceLine]:
-    """A track of the run directory, named as in the settings, and its line."""
-    name = Path(setting).stem
+def _driven_on(run_dir: Path, setting: str, label: str, size: str = "") -> tuple[Track, RaceLine]:
+    """A track of the run directory, named as in the settings, or a copy of it of that ``size``, and
+    its line."""
+    name = Path(setting).stem + size
     track = replace(read_track(run_dir / f"{label}.csv", car_width_m=0.0), name=name)
     return track, read_raceline(run_dir / f"{label}_raceline.csv", name)
 
@@ -271,7 +274,8 @@ def _read_training(
         return None, True
     try:
         log = LogColumns(path, RUN_COLUMNS).read()
-        track, line = _driven_on(run_dir, settings.train_track, label)
+        size = label.removeprefix("train").removeprefix("practice")
+        track, line = _driven_on(run_dir, settings.train_track, label, size)
     except InputError as error:
         _log.warning("a training drive is left out: %s", error)
         return None, False

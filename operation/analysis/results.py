@@ -146,10 +146,15 @@ class RaceResult(_Frozen):
         None,
         description="the last training drive on its own track, all of its samples; null without",
     )
-    practice: LapResult | None = Field(
+    practices: dict[str, LapResult] = Field(
+        default_factory=dict,
+        description="the controller's own laps before it raced, all of their samples, by track: "
+        "the training track, and larger copies of it; empty without",
+    )
+    coverage: float | None = Field(
         None,
-        description="the controller's own laps of the training track before it raced, all of their "
-        "samples; null without",
+        description="share of the racing line's time at speeds and lateral accelerations that "
+        "were driven before, in the last training drive and in practice; null without these",
     )
     gp: dict[str, GpMetrics] = Field(
         description="output (vx, vy, omega) to metrics of the first weights on the BestCase run; "

@@ -49,7 +49,7 @@ def collect(
 
     from bayesrace.codegen.build import build
     from bayesrace.codegen.settings import BuildSettings
-    from bayesrace.operation.preparation import drive_for_training
+    from bayesrace.operation.training_drives import drive_for_training
     from bayesrace.raceline import read_raceline_for
     from bayesrace.tracks import load_track
 

@@ -16,6 +16,7 @@ from bayesrace.files import write_whole
 from bayesrace.manifest import Manifest
 from bayesrace.operation.analysis.race import RaceAnalysis, read_race
 from bayesrace.operation.analysis.results import RaceResult, write_result
+from bayesrace.operation.report.coverage import coverage_figure
 from bayesrace.operation.report.gp import gp_figures
 from bayesrace.operation.report.maps import lap_maps
 from bayesrace.operation.report.panels import lap_figures, solve_figure, time_figures
@@ -149,11 +150,14 @@ def _figures(analysis: RaceAnalysis) -> Iterator[tuple[str, list[Figure]]]:
     if data is not None and analysis.validations:
         progress = track.project_path(data.x[:, :2]).progress_m
         yield "gp", gp_figures(analysis.validations, progress, track.length_m)
-    driven = (analysis.training, recording.training), (analysis.practice, recording.practice)
+    drives = [analysis.training, *analysis.practices.values()]
+    driven = zip(drives, [recording.training, *recording.practices], strict=True)
     maps = [
         figure for run, on in driven if run and on
         for figure in lap_maps([run], on.track, on.line)
     ]  # fmt: skip
+    if analysis.coverage is not None:
+        maps.append(coverage_figure(analysis.coverage))
     if maps:
         yield "training", maps
     if any(len(run.record.telemetry) for run in runs):

@@ -167,11 +167,15 @@ def print_table(result: RaceResult, console: Console) -> None:
     for lap in result.laps:
         if facts := _facts(lap):
             console.print(Text(f"{lap.name}: {', '.join(facts)}"))
-    for what, drive in ("training drive", result.training), ("practice", result.practice):
-        if drive is not None:
-            style = "yellow" if drive.off_track_samples else ""
-            text = f"{what} on {summary.train_track}: {drive_text(drive)}"
-            console.print(Text(text, style=style))
+    drives = {f"practice on {on}": drive for on, drive in result.practices.items()}
+    if result.training is not None:
+        drives = {f"training drive on {summary.train_track}": result.training} | drives
+    for what, drive in drives.items():
+        style = "yellow" if drive.off_track_samples else ""
+        console.print(Text(f"{what}: {drive_text(drive)}", style=style))
+    if result.coverage is not None:
+        share = f"driven before: {100 * result.coverage:.0f} % of the racing line's time"
+        console.print(Text(f"{share}, by speed and lateral acceleration"))
     _print_notes(result, console)
 
 

@@ -32,6 +32,7 @@ from bayesrace.operation.analysis.laps import trajectory_digest
 from bayesrace.operation.closed_loop import ClosedLoop, Driven, built_in_car
 from bayesrace.operation.settings import PreparationSettings, RaceSettings
 from bayesrace.operation.terminal.terminal import stages_on
+from bayesrace.operation.training_drives import SOURCES
 from bayesrace.sensors import EXACT
 from bayesrace.vehicles import CarParameters
 
@@ -63,7 +64,7 @@ _LEFT_OUT: Final = {"car", "threads", "fmu", "fmu_map", "simulator", "line"}
 """Settings that a row has in other columns, or that no campaign has."""
 
 _SOURCES: Final = (
-    *preparation.SOURCES, "codegen", "codegen/problems", "operation/analysis/laps.py",
+    *SOURCES, "codegen", "codegen/problems", "operation/analysis/laps.py",
     "operation/preparation.py", "operation/settings.py", "studies/campaign/case.py",
 )  # fmt: skip
 _PACKAGES: Final = ("casadi", "mcap", "numpy", "scipy")
