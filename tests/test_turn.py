@@ -186,12 +186,12 @@ def test_a_standing_car_creeps_along_its_line_where_no_optimisation_finds_a_plan
     step = NativeStep(build(BuildSettings(car=car, problem=problem))[0], car, HOPELESS)
     step.set_path(circuit.table)
     rig = rig_at(step, circuit, standing(circuit, 1.0, 0.02, 0.3))
-    drive(rig, 40)
+    drive(rig, 15)
     crept = rig.driver.count("creeping")
     assert crept >= 1  # between, the fallback drives on by that plan
     assert rig.x[3] > 0.2
-    assert 0.05 < (where(rig) - 1.0) % circuit.line.length_m < 1.5
-    assert circuit.track.project_points(rig.x[None, :2]).off_track_m.max() < -0.1
+    assert 0.02 < (where(rig) - 1.0) % circuit.line.length_m < 0.5
+    assert circuit.track.project_points(rig.x[None, :2]).off_track_m.max() < 0
     step.reset()
     rig.x[3] = 1.0
     rig.cycle()  # a car that rolls is braked by the fallback
