@@ -442,10 +442,11 @@ static void lead(br_mpc *mpc, int k, double angle, double x[BR_NX]) {
 
 /* A standing car has the same problem in each cycle. If no optimisation finds a plan, or the best
  * one is to stay, to drive off later, or backwards, it would stand for ever: so it creeps, steered
- * as the braking plan is. */
+ * as the braking plan is, or round. */
 int br_creep(br_mpc *mpc) {
     double x[BR_NX], s_m = -1, angle = 0, outside_m;
-    if (!mpc->path.ready || mpc->own_reference || mpc->turn) return 0;
+    if (!mpc->path.ready || mpc->own_reference) return 0;
+    if (mpc->turn) return 1;
     if (mpc->x0[BR_INDEX_VX] >= walking_pace(mpc)) return 0;
     memcpy(x, mpc->x0, sizeof x);
     for (int k = 0; k < BR_N; ++k) {
@@ -458,7 +459,7 @@ int br_creep(br_mpc *mpc) {
 void br_note_standing(br_mpc *mpc) {
     const double speed = mpc->x0[BR_INDEX_VX];
     const int may_drive = mpc->path.speed_limit >= BR_TURN_STOP_MPS;
-    if (may_drive && fabs(speed) < BR_TURN_STOP_MPS)
+    if (may_drive && fabs(speed) < walking_pace(mpc) / 4)
         mpc->stood += fmin(mpc->elapsed, BR_TS);
     else
         mpc->stood = 0;

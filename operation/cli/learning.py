@@ -250,7 +250,7 @@ def rollback(
 
 @options_of(
     "bayesrace.operation.learn.records.LearnSettings",
-    "laps points keep track seed car name",
+    "laps every points keep track seed car name",
 )
 def learn(
     learning: "Endpoints",

@@ -2,7 +2,7 @@
 
 import math
 import time
-from collections import deque
+from collections import Counter, deque
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -71,15 +71,25 @@ class Collector:
     has arrived.
     """
 
-    def __init__(self, car: CarParameters, step_s: float, track: Track | None = None) -> None:
-        """``track``: times laps to less than a period, and measures excursions."""
+    def __init__(
+        self,
+        car: CarParameters,
+        step_s: float,
+        track: Track | None = None,
+        every_s: float | None = None,
+    ) -> None:
+        """``track``: times laps to less than a period, and measures excursions. ``every_s``:
+        length of a stretch at most."""
         self._car, self._step_s, self._track = car, step_s, track
+        self._most = min(MOST_STATES, round(every_s / step_s) + 1) if every_s else MOST_STATES
         self._line = None if track is None else StartLine(track)
         self._begin_s: float | None = None
         """Plant time when the lap began that is evaluated next, if that was seen."""
         self._open = Stretch()
         self._ended: deque[Stretch] = deque()
         self._run, self._laps = (-1, -1), 0
+        self._lap = LapRecord(run=-1, time_s=None, flying=False)
+        """Of all stretches since the last lap ended."""
         self._cycles: deque[Telemetry] = deque(maxlen=2 * MOST_STATES)
         """Those in which the fallback drove, or the state was estimated or not believed."""
         self._waited_s, self._looked_s = 0.0, time.monotonic()
@@ -95,7 +105,7 @@ class Collector:
         states.append(state)
         if state.lap > self._laps:
             self._end_lap(state)
-        elif len(states) >= MOST_STATES:  # the lap keeps its time, should it ever end
+        elif len(states) >= self._most:  # the lap keeps its time, should it ever end
             self._end(Stretch(self._open.flying, states=[state]))
         if state.final:
             self._end(Stretch())
@@ -172,9 +182,10 @@ class Collector:
 
     def _evaluate(self, stretch: Stretch) -> None:
         states, lap = stretch.states, stretch.lap
-        run, first, last = states[0].run, states[0].seq, states[-1].seq
+        run, first = states[0].run, states[0].seq
         if stretch.first:
             self._begin_s = 0.0 if states[0].time_s == 0 else None
+            self._lap = LapRecord(run=run, time_s=None, flying=False)
         cycles = [one for one in self._cycles if one.run == run and one.state_seq >= first]
         columns = columns_of(State, states, STATES), columns_of(Telemetry, cycles, CYCLES)
         samples, why_not = None, ""
@@ -188,17 +199,28 @@ class Collector:
         stretch.samples = samples
         # A short stretch that is no lap, such as the end of a run, may well be of no use.
         stretch.why_not = why_not if lap is not None or len(states) >= 50 else ""
+        self._count(stretch, columns)
         if lap is not None:
-            fallbacks = {one.state_seq for one in cycles if one.fallback and one.state_seq < last}
-            lap.versions, lap.fallbacks = list(stretch.versions), len(fallbacks)
             crossed_s = self._crossing_s(columns[0][-2:], columns[1])
             lap.time_s = self._lap_time_s(crossed_s, states[-1].lap - states[0].lap)
-            if samples is not None:
-                lap.samples, lap.left_out = len(samples), samples.dropped
-            known = with_estimates(*columns)["x"]
-            if self._track is not None and len(known):
-                path = self._track.project_path(known[:, :2])
-                lap.off_track_m = max(float(np.max(path.off_track_m)), 0.0)
+            for name in ("versions", "fallbacks", "samples", "left_out", "off_track_m"):
+                setattr(lap, name, getattr(self._lap, name))
+            self._lap = LapRecord(run=run, time_s=None, flying=True)
+
+    def _count(self, stretch: Stretch, columns: tuple[Columns, Columns]) -> None:
+        """Adds what a stretch says of its lap."""
+        lap, samples, last = self._lap, stretch.samples, stretch.states[-1].seq
+        lap.versions = [*dict.fromkeys([*lap.versions, *stretch.versions])]
+        cycles = columns[1]
+        driven = cycles["state_seq"][(cycles["fallback"] > 0) & (cycles["state_seq"] < last)]
+        lap.fallbacks += len({*driven})
+        if samples is not None:
+            lap.samples += len(samples)
+            lap.left_out = Counter(lap.left_out) + Counter(samples.dropped)
+        known = with_estimates(*columns)["x"]
+        if self._track is not None and len(known):
+            off_m = float(np.max(self._track.project_path(known[:, :2]).off_track_m))
+            lap.off_track_m = max(off_m, lap.off_track_m or 0.0)
 
 
 def _moved(x: Floats, duration_s: float) -> Floats:

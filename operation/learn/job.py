@@ -97,7 +97,9 @@ class Learner:
         """``say``: prints a line; ``track``: times laps."""
         settings = self._settings = journal.settings
         self._journal, self._say = journal, say
-        self._collector = Collector(settings.car, settings.discretisation.step_s, track)
+        self._collector = Collector(
+            settings.car, settings.discretisation.step_s, track, settings.every
+        )
         self._publisher = Publisher(session, journal, say)
         self._trainer = Trainer()
         self._inbox = Inbox(session, settings.name)
@@ -136,9 +138,13 @@ class Learner:
                 self._end()
 
     def _done(self) -> bool:
-        enough = self._settings.laps is not None and self._laps >= self._settings.laps
         busy = self._due or self._trainer.busy or self._publisher.unanswered
-        return self._ending or (enough and not busy)
+        return self._ending or (self._enough and not busy)
+
+    @property
+    def _enough(self) -> bool:
+        """Whether all laps that were wanted have been driven."""
+        return self._settings.laps is not None and self._laps >= self._settings.laps
 
     def _end(self) -> None:
         """Ends the training; what was driven is on file for the next job."""
@@ -180,6 +186,8 @@ class Learner:
         if stretch.lap is not None:
             self._laps, self._due = self._laps + 1, True
             self._say(_in_words(stretch.lap))
+        elif self._settings.every and stretch.samples is not None:
+            self._due |= not self._enough
         if stretch.why_not and self._journal.remark(stretch.why_not):
             self._say(f"nothing to learn from: {stretch.why_not}")
 

@@ -32,6 +32,12 @@ class LearnSettings(BaseModel):
     points: int = Field(400, ge=20, le=MAX_POINTS, description="training points per output")
     keep: int = Field(1200, ge=100, le=20_000, description="samples kept from lap to lap")
     laps: int | None = Field(None, ge=1, description="end after so many laps")
+    every: float | None = Field(
+        None,
+        ge=0.5,
+        le=200,
+        description="learn after so many seconds of driving, not only after a lap",
+    )
     track: str | None = Field(
         None, description="track that is driven, for exact lap times and excursions"
     )
@@ -55,7 +61,7 @@ class LapRecord(BaseModel):
 class UpdateRecord(BaseModel):
     """One training, and what became of its weights."""
 
-    after_lap: int = Field(description="last lap that it learned from; 0: only the data given")
+    after_lap: int = Field(description="last lap that had ended; 0: none")
     version: str = Field("", description="of its weights; empty if there are none")
     file: str = Field("", description="of the weights; old ones are deleted")
     samples: int = Field(0, description="learned from")
