@@ -24,10 +24,13 @@ def states() -> list[State]:
 
 
 def fed(
-    states: list[State], fallbacks: tuple[int, ...] = (), track: Track | None = None
+    states: list[State],
+    fallbacks: tuple[int, ...] = (),
+    track: Track | None = None,
+    every_s: float | None = None,
 ) -> tuple[list[Stretch], list[Stretch]]:
     """What is given out as it arrives, and at the end."""
-    made, taken = Collector(CAR, STEP_S, track), []
+    made, taken = Collector(CAR, STEP_S, track, every_s), []
     for one in states:
         made.state(one)
         version = f"v{one.seq // 100}"
@@ -208,3 +211,16 @@ def test_memory_does_not_follow_a_car_that_stands(
     assert sum(sizes) == 200
     times = [one.lap.time_s for one in taken if one.lap is not None]
     assert times == pytest.approx([61 * STEP_S, 100 * STEP_S])
+
+
+def test_stretches_of_some_seconds_make_the_same_laps(states: list[State]) -> None:
+    """No sample, fallback or version of a lap is lost, and laps have the same times."""
+    fallbacks = (10, 60, 61, 62, 130)
+    (whole, rest), (taken, left) = fed(states, fallbacks), fed(states, fallbacks, every_s=0.5)
+    assert len(taken) > len(whole) + 4
+    assert all(len(one.states) <= 26 for one in taken + left)
+    np.testing.assert_array_equal(samples(taken + left).x, samples(whole + rest).x)
+    laps = [[one.lap for one in some if one.lap is not None] for some in (whole, taken)]
+    assert laps[0] == laps[1]
+    assert (laps[0][1].fallbacks, laps[0][1].versions) == (3, ["v0", "v1"])
+    assert laps[0][1].samples + sum(laps[0][1].left_out.values()) == 100
