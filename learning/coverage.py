@@ -46,13 +46,13 @@ class Coverage:
     def __str__(self) -> str:
         """In words, with what is missing."""
         text = f"{100 * self.share:.0f} % of the racing line's time is at speeds and lateral "
-        text += "accelerations that were driven before"
+        text += "accelerations that were driven"
         if self.near.all():
             return text
         speed, across = self.asked[~self.near].T
         return (
-            f"{text}; missing are {speed.min():.2f} to {speed.max():.2f} m/s with "
-            f"{across.min():.1f} to {across.max():.1f} m/s² across"
+            f"{text}; drive {speed.min():.2f} to {speed.max():.2f} m/s with "
+            f"{across.min():.1f} to {across.max():.1f} m/s² across, slowly at first"
         )
 
 

@@ -14,6 +14,7 @@ from bayesrace.cache import code_folder, kept
 from bayesrace.codegen.build import build
 from bayesrace.codegen.compiler import find_compiler
 from bayesrace.codegen.settings import BuildSettings
+from bayesrace.controller.assembly import compiled_controller
 from bayesrace.gp.weights import encode_weights, read_weights, write_weights
 from bayesrace.integrators import Discretisation
 from bayesrace.learning.coverage import coverage
@@ -32,8 +33,8 @@ from bayesrace.operation.training_drives import (
     training_drive,
     training_track,
 )
-from bayesrace.raceline import RaceLine
 from bayesrace.tracks import load_track
+from bayesrace.vehicles import CarParameters
 
 __all__ = [
     "Prepared",
@@ -46,8 +47,8 @@ __all__ = [
 
 _log = logging.getLogger(__name__)
 
-_MORE: Final = 3
-"""Larger copies of the training track that practice goes on to at most."""
+_MOST_COPIES: Final = 3
+"""Of the training track, larger ones, that practice goes on to."""
 
 PredictionModel = Literal["e_kinematic", "dynamic"]
 
@@ -119,17 +120,16 @@ def prepare(
     if artefact is None:
         with stages.stage("build the controllers"):
             artefacts = [_artefact(settings, model) for model in models]
-    training, practices, lines = None, list[Training](), [one.line for one in prepared_tracks]
+    training, practices = None, list[Training]()
     if weights is None:
-        training, practices, weights = _learned(settings, artefacts[0], lines, stages)
+        training, practices, weights = _learned(settings, artefacts[0], prepared_tracks, stages)
     return Prepared(tuple(prepared_tracks), training, tuple(practices), weights, tuple(artefacts))
 
 
 def _learned(
-    settings: PreparationSettings, artefact: Path, lines: Sequence[RaceLine], stages: Stages
+    settings: PreparationSettings, artefact: Path, races: Sequence[PreparedTrack], stages: Stages
 ) -> tuple[Training, list[Training], Path]:
-    """The training drives and practice, and the weights learned from both, for races on these
-    lines."""
+    """The training drives and practice, and the weights learned from both, for these races."""
     car = settings.driven_car
     track = load_track(settings.train_track, car.width_m)
     with stages.stage(f"training line, {track.name}"):
@@ -142,7 +142,7 @@ def _learned(
         learned = training.samples, settings.discretisation, training_settings(settings)
         weights = trained_weights(*learned, progress=stage.update)
     every, practices, course, size = training.samples, list[Training](), on, 1.0
-    while settings.practice_laps and len(practices) <= _MORE:
+    while settings.practice_laps:
         with stages.stage(f"practice, {course.track.name}"):
             laps = practice(course, car, settings, artefact, weights)
         if laps is None:
@@ -152,14 +152,29 @@ def _learned(
         with stages.stage(f"train the residual with practice{number}") as stage:
             samples = [every, laps.samples]
             weights, every = updated_weights(samples, settings, weights, stage.update)
-        wanted = coverage(lines, every.x)
-        if wanted.share >= settings.coverage:
+        lost = _lost(artefact, car, races, weights)
+        if lost <= settings.practice_until:
             break
-        found = larger_course(on, size, wanted, car, settings.raceline)
+        known = coverage([one.line for one in races], every.x)
+        more = len(practices) <= _MOST_COPIES
+        found = larger_course(on, size, known, car, settings.raceline) if more else None
         if found is None:
+            _log.warning("first laps lose %.1f %%: of %s, %s", 100 * lost, track.name, known)
             break
         size, course = found
     return training, practices, weights
+
+
+def _lost(
+    artefact: Path, car: CarParameters, races: Sequence[PreparedTrack], weights: Path
+) -> float:
+    """Of a lap, the largest share that a race loses where its line is faster than what the weights
+    know."""
+    learned, lost = read_weights(weights), 0.0
+    for race in races:
+        controller = compiled_controller(artefact, car, race.track, race.line, learned)
+        lost = max(lost, controller.native.unknown_s / race.line.lap_time_s)
+    return lost
 
 
 def training_settings(settings: PreparationSettings) -> TrainingSettings:

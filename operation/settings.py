@@ -56,13 +56,12 @@ class PreparationSettings(CarSimulation):
         description="laps of the training track by the controller itself, with its default "
         "settings, which it learns from before it races",
     )
-    coverage: float = Field(
-        0.9,
+    practice_until: float = Field(
+        0.01,
         ge=0,
         le=1,
-        description="share of the race line's time that is to be at speeds and lateral "
-        "accelerations that were driven before: until then practice goes on, on larger copies "
-        "of the training track",
+        description="practice goes on, on larger copies of the training track, while more than "
+        "this share of a lap would be lost where the racing line is faster than what was learned",
     )
     points: int = Field(400, ge=20, le=1024, description="training points per output")
     kernels: tuple[Kernel, ...] = Field(

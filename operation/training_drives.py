@@ -69,10 +69,10 @@ SOURCES: Final = (
 
 LARGER: Final = (1.25, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0)
 """Sizes of the copies of a training track, over its own."""
-_LEFT: Final = 0.1
+_REMAINING: Final = 0.1
 """Of what is missing, the most that a lap of the copy that is chosen leaves ..."""
-_ENOUGH: Final = 0.02
-"""... or of all that is wanted."""
+_NEGLIGIBLE: Final = 0.02
+"""... or of the whole lap."""
 
 _log = logging.getLogger(__name__)
 
@@ -130,21 +130,21 @@ def prepared_track(
 def larger_course(
     on: PreparedTrack,
     size: float,
-    wanted: Coverage,
+    known: Coverage,
     car: CarParameters,
     settings: RaceLineSettings,
 ) -> tuple[float, PreparedTrack] | None:
     """The smallest copy of the training track, of those that are larger than ``size`` times, on
-    which the car is driven at nearly all that is ``wanted`` and was not driven before; and how
-    much larger it is. None: there is none.
+    which the car is driven at nearly all that was not ``known`` before; and how much larger it
+    is. None: there is none.
 
     The line is the same, larger, at the speeds that friction and drive allow.
     """
     for larger in (one for one in LARGER if one > size):
         name = f"{on.track.name}-x{larger:g}"
         line = timed_line(name, fit_arc_length(larger * on.line.xy_m), car, settings)
-        left = 1 - wanted.with_samples(asked([line])).share
-        if left > max(_LEFT * (1 - wanted.share), _ENOUGH):
+        left = 1 - known.with_samples(asked([line])).share
+        if left > max(_REMAINING * (1 - known.share), _NEGLIGIBLE):
             continue
         track = _enlarged(on.track, larger, name)
         file = raceline_file(track, car, settings).with_name(_LINE)

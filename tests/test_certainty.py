@@ -219,7 +219,7 @@ def fast_race(folder: Path, practice_laps: int) -> tuple[Prepared, RaceSettings]
     track = Track.from_points("fast", np.column_stack([x, y]), left, right)
     write_track(folder / "fast.csv", track)
     settings = RaceSettings(
-        track=str(folder / "fast.csv"), practice_laps=practice_laps, coverage=0.0
+        track=str(folder / "fast.csv"), practice_laps=practice_laps, practice_until=1.0
     )
     with stages_on(Console(quiet=True)) as stages:
         return prepare(settings, (settings.track,), stages), settings

@@ -275,7 +275,8 @@ class Telemetry(Message, frozen=True, kw_only=True, tag=6):
     much more has jumped to another local minimum."""
     second_start: Annotated[int, Meta(ge=0, le=3)]
     """1: the previous plan was doubtful, and a second start gave no better one; 2: the plan of the
-    second start is used; 3: no start has led to a plan, and the slow car creeps along its line."""
+    second start is used; 3: the slow car creeps along its line, or is led round, as no start has
+    led to a plan, or as it has stood for too long."""
     s_ref_m: Number
     """Arc length of the reference point on the racing line."""
     n_ref_m: Number

@@ -152,7 +152,7 @@ typedef struct {
     int64_t levels[BR_STOP + 1]; /* cycles by level of the fallback; commanded ones left out */
     int64_t failed;              /* steps that refused the call or raised an exception */
     int64_t second_starts;       /* steps that looked for another plan */
-    int64_t creeping;            /* steps that found no plan but to creep along the line */
+    int64_t creeping;            /* steps of a slow car that creeps: see br_mpc_info.second_start */
     int64_t cost_jumps;          /* steps whose plan costs much more than to go on as before */
     int64_t stale;               /* states of the current run that were not newer than one before */
     int64_t foreign; /* states of another plant or run, or far ahead, that were not driven on */

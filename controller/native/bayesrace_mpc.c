@@ -131,6 +131,7 @@ void br_mpc_reset(br_mpc *mpc) {
     br_caution_reset(&mpc->caution);
     br_mismatch_reset(&mpc->mismatch);
     mpc->turn = 0;
+    mpc->stood = mpc->stuck = 0;
     mpc->attempts = mpc->starts = mpc->futile = mpc->looks = 0;
 }
 

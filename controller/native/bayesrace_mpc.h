@@ -116,8 +116,9 @@ typedef struct {
     int regularised;         /* iterations whose Hessian had to be made positive definite */
     int shortened;           /* steps that the line search halved */
     int second_start;        /* 1: the plan from before was doubtful, and a new one no better;
-                              * 2: the new one is better; BR_CREEPS: no start has led to a plan,
-                              * and the slow car creeps along its line */
+                              * 2: the new one is better; BR_CREEPS: none, but the slow car creeps
+                              * along its line, or is led round, as no start has led to a plan, or
+                              * as it has stood for too long */
     int shifts;              /* stages by which the plan was shifted; -1: there was no plan */
     int prepared;            /* 1: br_mpc_prepare had linearised and factorised already */
     int prepared_iterations; /* SQP iterations of br_mpc_prepare since the step before */

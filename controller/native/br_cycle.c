@@ -410,8 +410,9 @@ static void reckon(br_cycle *cycle, double decided_at_s) {
 static void count(br_cycle *cycle, int status) {
     const br_solution *solution = &cycle->solution;
     cycle->counters.failed += status == BR_STEP_FAILED;
-    cycle->counters.second_starts += solution->second_start > 0;
-    cycle->counters.creeping += solution->second_start == BR_CREEPS;
+    const int creeps = solution->second_start == BR_CREEPS;
+    cycle->counters.second_starts += solution->second_start > 0 && !creeps;
+    cycle->counters.creeping += creeps;
     if (solution->shifted_cost >= 0)
         cycle->counters.cost_jumps += solution->cost > JUMP * solution->shifted_cost + JUMP_BY;
 }

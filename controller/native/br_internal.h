@@ -259,8 +259,8 @@ struct br_mpc {
     int follows;   /* the reference is where the plan is on the line, not points to track; ... */
     int first_row; /* ... the plan's first stage is at this row of the path */
     double turn;   /* the side that the car turns round to, 1 left, -1 right; 0: it does not */
-    double stood;  /* for so long, although it may drive */
-    int stuck;     /* too long: it is to creep until it rolls */
+    double stood;  /* [s] that the car has stood although it may drive */
+    int stuck;     /* that was too long: it creeps until it rolls */
     double led_u[BR_N][BR_NU]; /* inputs that lead the car round, or creeping along its line */
     /* the plan, primal and dual */
     int warm;               /* a plan from the step before is there */

@@ -366,8 +366,11 @@ br_mpc_error br_steer(const br_mpc *mpc, const double x[BR_NX], double *s_m, dou
  * the other way. */
 #define BEGIN_RAD (BR_FOLLOWS_PLAN ? BR_TURN_BEHIND_RAD : BR_TURN_AWAY_RAD)
 
-/* No car stands for so long on purpose. */
+/* No car that may drive stands for so long on purpose; slower than this share of a walking pace it
+ * counts as standing, and it has begun to roll at that one. */
 #define STUCK_S 0.5
+#define STANDING 0.25
+#define ROLLING 0.5
 
 /* Angle to the point, seen from the car; positive left. */
 static double bearing(const double x[BR_NX], const double to[2]) {
@@ -402,12 +405,12 @@ static double bearing_on_line(const br_path *path, const double to[2]) {
     return bearing(here, to);
 }
 
-/* Whether the target is far to one side, farther than for a car on the line; for one that has stood
- * for long, farther than where it would drive on. */
+/* Whether the target is far to one side, farther than for a car on the line. One that has stood for
+ * too long need not be so far off. */
 static int to_one_side(const br_mpc *mpc, double away, const double target[2]) {
-    if (fabs(away) > BR_TURN_FACED_RAD && mpc->stood > STUCK_S) return 1;
-    const double usual = bearing_on_line(&mpc->path, target);
-    return fabs(away) > BEGIN_RAD && fabs(remainder(away - usual, 2 * M_PI)) > BEGIN_RAD;
+    const double begin = mpc->stood > STUCK_S ? BR_TURN_FACED_RAD : BEGIN_RAD;
+    if (fabs(away) <= begin) return 0;
+    return fabs(remainder(away - bearing_on_line(&mpc->path, target), 2 * M_PI)) > begin;
 }
 
 /* Begins, goes on with and ends a turn, of a slow or turning car. */
@@ -457,13 +460,11 @@ int br_creep(br_mpc *mpc) {
 }
 
 void br_note_standing(br_mpc *mpc) {
-    const double speed = mpc->x0[BR_INDEX_VX];
+    const double share = mpc->x0[BR_INDEX_VX] / fmax(walking_pace(mpc), BR_TURN_STOP_MPS);
     const int may_drive = mpc->path.speed_limit >= BR_TURN_STOP_MPS;
-    if (may_drive && fabs(speed) < walking_pace(mpc) / 4)
-        mpc->stood += fmin(mpc->elapsed, BR_TS);
-    else
-        mpc->stood = 0;
-    mpc->stuck = mpc->stood > STUCK_S || (mpc->stuck && may_drive && speed < walking_pace(mpc) / 2);
+    const int stands = may_drive && share < STANDING;                 /* or rolls backwards */
+    mpc->stood = stands ? mpc->stood + fmin(mpc->elapsed, BR_TS) : 0; /* a gap says nothing */
+    mpc->stuck = mpc->stood > STUCK_S || (mpc->stuck && may_drive && share < ROLLING);
 }
 
 void br_turnaround(br_mpc *mpc) {

@@ -47,7 +47,8 @@ static void align(br_mpc *mpc, int shifts) {
     if (!mpc->valid[BR_LINEARISATION]) br_linearise_plan(mpc);
 }
 
-/* The plan of a slow car that creeps, kept for when no other is found. */
+/* The plan of a slow car that creeps, kept for when no other is found; made before the others, as a
+ * budget may leave no time after them. */
 static void keep_creeping(br_mpc *mpc) {
     mpc->begun.status = BR_NOT_FINITE;
 #if BR_HAS_PATH
@@ -59,6 +60,11 @@ static void keep_creeping(br_mpc *mpc) {
 #endif
 }
 
+/* Whether the plan at hand is that of a car that has stood for too long. */
+static int creeps(const br_mpc *mpc) {
+    return !mpc->warm && mpc->stuck && br_usable(mpc->begun.status);
+}
+
 /* The plan at the time of the measured state. Without one, or with one that is older than the
  * horizon or has not become usable in as many iterations as a cold start may take, a new one. */
 static void begin_plan(br_mpc *mpc) {
@@ -68,7 +74,7 @@ static void begin_plan(br_mpc *mpc) {
         align(mpc, mpc->info.shifts);
     } else {
         keep_creeping(mpc);
-        br_sqp_cold_start(mpc);
+        if (!creeps(mpc)) br_sqp_cold_start(mpc);
         br_invalidate(mpc, BR_TUBE);
         mpc->lag = mpc->unfinished = 0;
         mpc->info.shifts = -1;
@@ -237,10 +243,13 @@ static br_mpc_status optimise(br_mpc *mpc) {
     begin_plan(mpc);
     timer->iteration = timer->trial = 0; /* a stall must not be remembered for ever */
     const int most = iteration_limit(mpc);
+    if (creeps(mpc)) {
+        mpc->info.second_start = BR_CREEPS;
+        return mpc->begun.status;
+    }
     if (!mpc->warm) {
         const int limit = timer->limited ? most : mpc->parameters.iterations_cold;
-        const int creeps = mpc->stuck && br_usable(mpc->begun.status);
-        return or_creep(mpc, creeps ? BR_DEFECT : start_cold(mpc, limit));
+        return or_creep(mpc, start_cold(mpc, limit));
     }
     br_residuals(mpc);
     const double shifted_cost = mpc->info.cost;
@@ -335,7 +344,7 @@ static void plan_reference(br_mpc *mpc) {
     br_path_plan(&mpc->path, mpc->caution.pace, mpc->reference);
     br_turnaround(mpc);
     if (mpc->turn) mpc->follows = 0;
-    if (mpc->stuck) mpc->warm = 0;
+    if (mpc->stuck) mpc->warm = 0; /* to go on with the plan from before would be to stay */
 }
 #endif
 
@@ -370,6 +379,7 @@ static br_mpc_error br_solve(br_mpc *mpc, const double x[BR_NX], const double u_
     if (error || !plausible) return error;
     memcpy(mpc->reference, reference, sizeof mpc->reference);
     mpc->turn = mpc->follows = 0;
+    mpc->stood = mpc->stuck = 0;
     mpc->own_reference = 1;
     solve(mpc, u, status, info);
     return BR_OK;

@@ -235,7 +235,7 @@ class RaceAnalysis:
     @cached_property
     def coverage(self) -> Coverage | None:
         """How much of the racing line was driven in training and practice; None without these."""
-        found = [one.run.x for one in (self.recording.training, *self.recording.practices) if one]
+        found = [one.x for one in (self.recording.training, *self.recording.practices) if one]
         return coverage([self.line], np.vstack(found)) if found else None
 
     @cached_property
@@ -278,7 +278,7 @@ class RaceAnalysis:
             limit_s=limit_s,
             training=None if self.training is None else self.training.result(),
             practices={on: run.result(practised) for on, run in self.practices.items()},
-            coverage=None if self.coverage is None else self.coverage.share,
+            line_driven=None if self.coverage is None else self.coverage.share,
             gp=metrics.get("bayesrace", {}),
             gp_updated=metrics.get("bayesrace-updated", {}),
             real_time_factor=_real_time_factor(recording.runs),

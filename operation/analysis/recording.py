@@ -9,6 +9,7 @@ from typing import Annotated, Any, Final
 import numpy as np
 from pydantic import BaseModel, BeforeValidator, Field, ValidationError
 
+from bayesrace.arrays import Floats
 from bayesrace.columns import Columns, LogColumns, with_estimates
 from bayesrace.errors import InputError, faults_in
 from bayesrace.files import read_text
@@ -174,6 +175,8 @@ class TrainingRecord:
     run: RunRecord
     track: Track
     line: RaceLine
+    x: Floats
+    """States (n, 7) of all drives in the log."""
 
 
 class _Mpc(BaseModel):
@@ -282,7 +285,9 @@ def _read_training(
     runs, _ = _planned(log)
     if not runs:
         return None, False
-    return TrainingRecord(runs[-1], track, line), not (log.reader.truncated or log.reader.refused)
+    x = np.vstack([run.x for run in runs])
+    whole = not (log.reader.truncated or log.reader.refused)
+    return TrainingRecord(runs[-1], track, line, x), whole
 
 
 def _planned(log: LogColumns) -> tuple[list[RunRecord], bool]:

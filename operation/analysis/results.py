@@ -151,10 +151,10 @@ class RaceResult(_Frozen):
         description="the controller's own laps before it raced, all of their samples, by track: "
         "the training track, and larger copies of it; empty without",
     )
-    coverage: float | None = Field(
+    line_driven: float | None = Field(
         None,
         description="share of the racing line's time at speeds and lateral accelerations that "
-        "were driven before, in the last training drive and in practice; null without these",
+        "were driven before, in training drives and practice; null without these",
     )
     gp: dict[str, GpMetrics] = Field(
         description="output (vx, vy, omega) to metrics of the first weights on the BestCase run; "

@@ -34,9 +34,10 @@ class LearnSettings(BaseModel):
     laps: int | None = Field(None, ge=1, description="end after so many laps")
     every: float | None = Field(
         None,
-        ge=0.5,
+        ge=2,
         le=200,
-        description="learn after so many seconds of driving, not only after a lap",
+        description="learn after so many seconds of driving, too, not after each lap alone; of "
+        "less than 2 s nobody could say whether the car has changed",
     )
     track: str | None = Field(
         None, description="track that is driven, for exact lap times and excursions"

@@ -1,5 +1,6 @@
 """Shows the record of a learning job: a table on the terminal, and lap time against lap number."""
 
+from itertools import groupby
 from pathlib import Path
 from typing import Final
 
@@ -21,14 +22,17 @@ _MOST_ROWS: Final = 40
 def print_laps(record: Record, console: Console | None = None) -> None:
     """Prints a row for each of the last laps, with the update that followed it."""
     console = console or Terminal()
-    updates = {update.after_lap: update for update in record.updates}
+    updates = {after: [*some] for after, some in groupby(record.updates, lambda one: one.after_lap)}
     table = plain_table("lap", "time\ns", "new", "of", "in\ns", "weights", "controller", left=0)
     for column in table.columns[-2:]:
         column.justify = "left"
-    if 0 in updates:
-        table.add_row("–", "", "", *_cells(updates[0]))
+    for update in updates.get(0, []):
+        table.add_row("–", "", "", *_cells(update))
     for lap in record.laps[-_MOST_ROWS:]:
-        table.add_row(str(lap.lap), _time(lap), str(lap.samples), *_cells(updates.get(lap.lap)))
+        after = updates.get(lap.lap, [])
+        table.add_row(str(lap.lap), _time(lap), str(lap.samples), *_cells(next(iter(after), None)))
+        for update in after[1:]:
+            table.add_row("", "", "", *_cells(update))
     if len(record.laps) > _MOST_ROWS:
         console.print(Text(f"the last {_MOST_ROWS} of {len(record.laps)} laps"))
     console.print(table)

@@ -173,8 +173,8 @@ def print_table(result: RaceResult, console: Console) -> None:
     for what, drive in drives.items():
         style = "yellow" if drive.off_track_samples else ""
         console.print(Text(f"{what}: {drive_text(drive)}", style=style))
-    if result.coverage is not None:
-        share = f"driven before: {100 * result.coverage:.0f} % of the racing line's time"
+    if result.line_driven is not None:
+        share = f"driven before: {100 * result.line_driven:.0f} % of the racing line's time"
         console.print(Text(f"{share}, by speed and lateral acceleration"))
     _print_notes(result, console)
 

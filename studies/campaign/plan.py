@@ -40,8 +40,8 @@ __all__ = ["Campaign", "read_plan"]
 
 _MOST_CASES: Final = 1_000_000
 _TRAINING: Final = (
-    "train_track", "seed", "collect_s", "practice_laps", "coverage", "points", "kernels", "widen",
-    "pursuit",
+    "train_track", "seed", "collect_s", "practice_laps", "practice_until", "points", "kernels",
+    "widen", "pursuit",
 )  # fmt: skip
 
 
