@@ -73,6 +73,7 @@ static void begin_plan(br_mpc *mpc) {
         mpc->info.shifts = shifts_due(&mpc->lag);
         align(mpc, mpc->info.shifts);
     } else {
+        undo_preparation(mpc); /* its plan is not gone on with */
         keep_creeping(mpc);
         if (!creeps(mpc)) br_sqp_cold_start(mpc);
         br_invalidate(mpc, BR_TUBE);

@@ -79,7 +79,8 @@ def test_a_revoked_director_is_cut_off_while_a_drive_goes_on(
                 tries += 1
         assert tries > 3
         assert rig.count("plant", *before) == before
-        assert rig.phase() in ("driving", "fallback")
+        # A machine that opens link after link may keep a state from the controller for a while.
+        until(lambda: rig.phase() in ("driving", "fallback"), "that the drive goes on")
         assert rig.director.status("plant").phase == "running"
         said = rig.plant.said()
         assert said.count("links of 'former'") == 1
