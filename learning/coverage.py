@@ -66,15 +66,8 @@ def asked(lines: Sequence[RaceLine]) -> Floats:
 def coverage(lines: Sequence[RaceLine], x: Floats) -> Coverage:
     """How much of what the lines ask for a car has been in that was in the states x (m, 7)."""
     places, driven = asked(lines), np.column_stack([x[:, 3], np.abs(x[:, 3] * x[:, 5])])
-    return Coverage(
-        places, np.concatenate([*map(_durations, lines)]), _near(places, driven), driven
-    )
-
-
-def _durations(line: RaceLine) -> Floats:
-    """Time of a lap from each point to the next, (n,) [s]."""
-    step = np.diff(np.append(line.s_m, line.s_m[0] + line.length_m))
-    return np.asarray(2 * step / (line.vx_mps + np.roll(line.vx_mps, -1)))
+    duration_s = np.concatenate([line.duration_s for line in lines])
+    return Coverage(places, duration_s, _near(places, driven), driven)
 
 
 def _near(places: Floats, driven: Floats) -> Flags:

@@ -98,10 +98,15 @@ class RaceLine:
     """None: not known; the line comes from elsewhere."""
 
     @property
-    def lap_time_s(self) -> float:
-        """Time of a flying lap at the line's speeds, acceleration constant between points."""
+    def duration_s(self) -> Floats:
+        """Time from each point to the next, (n,), acceleration constant between points."""
         step = np.diff(np.append(self.s_m, self.s_m[0] + self.length_m))
-        return float(np.sum(2.0 * step / (self.vx_mps + np.roll(self.vx_mps, -1))))
+        return np.asarray(2.0 * step / (self.vx_mps + np.roll(self.vx_mps, -1)))
+
+    @property
+    def lap_time_s(self) -> float:
+        """Time of a flying lap at the line's speeds."""
+        return float(np.sum(self.duration_s))
 
     @property
     def xy_m(self) -> Floats:

@@ -106,7 +106,13 @@ typedef struct {
     BR_SOLVER_FIELDS(BR_REAL_MEMBER, BR_WHOLE_MEMBER)
 } br_mpc_parameters;
 
-enum { BR_CREEPS = 3 }; /* of br_mpc_info.second_start */
+/* br_mpc_info.second_start, where there was one. */
+enum {
+    BR_NO_BETTER = 1, /* the plan from before was doubtful, and a new one no better */
+    BR_BETTER,        /* the new one is better, and used */
+    BR_CREEPS /* the slow car creeps along its line, or is led round, as no start has led to a plan,
+               * or as it has stood for too long */
+};
 
 /* What a step reports. */
 typedef struct {
@@ -115,10 +121,7 @@ typedef struct {
     int qp_iterations;       /* active-set iterations, summed */
     int regularised;         /* iterations whose Hessian had to be made positive definite */
     int shortened;           /* steps that the line search halved */
-    int second_start;        /* 1: the plan from before was doubtful, and a new one no better;
-                              * 2: the new one is better; BR_CREEPS: none, but the slow car creeps
-                              * along its line, or is led round, as no start has led to a plan, or
-                              * as it has stood for too long */
+    int second_start;        /* what came of it: BR_NO_BETTER, ...; 0: there was none */
     int shifts;              /* stages by which the plan was shifted; -1: there was no plan */
     int prepared;            /* 1: br_mpc_prepare had linearised and factorised already */
     int prepared_iterations; /* SQP iterations of br_mpc_prepare since the step before */

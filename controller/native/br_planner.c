@@ -448,7 +448,7 @@ static void lead(br_mpc *mpc, int k, double angle, double x[BR_NX]) {
  * as the braking plan is, or round. */
 int br_creep(br_mpc *mpc) {
     double x[BR_NX], s_m = -1, angle = 0, outside_m;
-    if (!mpc->path.ready || mpc->own_reference) return 0;
+    if (mpc->own_reference) return 0;
     if (mpc->turn) return 1;
     if (mpc->x0[BR_INDEX_VX] >= walking_pace(mpc)) return 0;
     memcpy(x, mpc->x0, sizeof x);

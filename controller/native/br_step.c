@@ -186,7 +186,7 @@ static br_mpc_status start_again(br_mpc *mpc, br_mpc_status status, unsigned tur
     if (br_usable(mpc->first.status) && br_usable(status) && !is_known(mpc, &mpc->first.plan))
         status = BR_DEFECT;
     status = br_first_plan_compare(mpc, status, &better);
-    mpc->info.second_start = better ? 2 : 1;
+    mpc->info.second_start = better ? BR_BETTER : BR_NO_BETTER;
     if (better)
         mpc->futile = mpc->starts = 0;
     else

@@ -241,13 +241,16 @@ def read_recording(run_dir: Path, log: LogColumns | None = None) -> Recording:
     ``log``: its ``run.mcap`` with :data:`RUN_COLUMNS`, of which only the rest is read then.
     """
     settings = _read_settings(run_dir / "settings.json")
-    track, line = _driven_on(run_dir, settings.track, "race")
+    track, line = _driven_on(run_dir, Path(settings.track).stem, "race")
     log = (log or LogColumns(run_dir / "run.mcap", RUN_COLUMNS)).read()
     firsts = [log[topic]["wall_ns"][:1] for topic in RUN_COLUMNS]
     runs, truth = _planned(log)
-    training, whole = _read_training(run_dir, settings, "collect.mcap", "train")
-    logs = sorted(run_dir.glob("practice*.mcap"), key=lambda path: path.stem)
-    practised = [_read_training(run_dir, settings, path.name, path.stem) for path in logs]
+    trained_on = Path(settings.train_track).stem
+    training, whole = _read_training(run_dir / "collect.mcap", trained_on, "train")
+    practised = [
+        _read_training(path, trained_on + path.stem.removeprefix("practice"), path.stem)
+        for path in sorted(run_dir.glob("practice*.mcap"), key=lambda path: path.stem)
+    ]
     return Recording(
         directory=run_dir, settings=settings, track=track, line=line, runs=runs, truth=truth,
         training=training, practices=[one for one, _ in practised if one is not None],
@@ -256,29 +259,23 @@ def read_recording(run_dir: Path, log: LogColumns | None = None) -> Recording:
     )  # fmt: skip
 
 
-def _driven_on(run_dir: Path, setting: str, label: str, size: str = "") -> tuple[Track, RaceLine]:
-    """A track of the run directory, named as in the settings, or a copy of it of that ``size``, and
-    its line."""
-    name = Path(setting).stem + size
+def _driven_on(run_dir: Path, name: str, label: str) -> tuple[Track, RaceLine]:
+    """A track of the run directory, with its name, and its line."""
     track = replace(read_track(run_dir / f"{label}.csv", car_width_m=0.0), name=name)
     return track, read_raceline(run_dir / f"{label}_raceline.csv", name)
 
 
-def _read_training(
-    run_dir: Path, settings: RunSettings, name: str, label: str
-) -> tuple[TrainingRecord | None, bool]:
-    """A training drive, if there was one, and whether its log ``name`` is whole; ``label``: of its
-    track and line.
+def _read_training(path: Path, name: str, label: str) -> tuple[TrainingRecord | None, bool]:
+    """A training drive on the track of that ``name``, if there was one, and whether its log is
+    whole; ``label``: of its track and line.
 
     The race does not need it: where it cannot be read, it is left out.
     """
-    path = run_dir / name
     if not path.is_file():
         return None, True
     try:
         log = LogColumns(path, RUN_COLUMNS).read()
-        size = label.removeprefix("train").removeprefix("practice")
-        track, line = _driven_on(run_dir, settings.train_track, label, size)
+        track, line = _driven_on(path.parent, name, label)
     except InputError as error:
         _log.warning("a training drive is left out: %s", error)
         return None, False

@@ -202,9 +202,9 @@ class Collector:
         self._count(stretch, columns)
         if lap is not None:
             crossed_s = self._crossing_s(columns[0][-2:], columns[1])
-            lap.time_s = self._lap_time_s(crossed_s, states[-1].lap - states[0].lap)
-            for name in ("versions", "fallbacks", "samples", "left_out", "off_track_m"):
-                setattr(lap, name, getattr(self._lap, name))
+            time_s = self._lap_time_s(crossed_s, states[-1].lap - states[0].lap)
+            known = {"run": run, "time_s": time_s, "flying": lap.flying}
+            stretch.lap = self._lap.model_copy(update=known)
             self._lap = LapRecord(run=run, time_s=None, flying=True)
 
     def _count(self, stretch: Stretch, columns: tuple[Columns, Columns]) -> None:

@@ -36,8 +36,8 @@ class LearnSettings(BaseModel):
         None,
         ge=2,
         le=200,
-        description="learn after so many seconds of driving, too, not after each lap alone; of "
-        "less than 2 s nobody could say whether the car has changed",
+        description="learn after so many seconds of driving, and after each lap; a shorter stretch "
+        "has too few samples to show that the car has changed",
     )
     track: str | None = Field(
         None, description="track that is driven, for exact lap times and excursions"
