@@ -1,6 +1,7 @@
 """Directs one run of a waiting plant and controller, from the start line to the last lap."""
 
 import time
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -38,6 +39,8 @@ class RunPlan:
     """The car stops unless the director is heard all the time; in real time only."""
     exact: bool = False
     """The state is known as it is, whatever the sensors."""
+    pause_s: float = 0.0
+    """After each such time there is a pause, see :class:`.RunRequest`; 0: never."""
 
 
 def run_request(track: Track, plan: RunPlan) -> RunRequest:
@@ -60,6 +63,7 @@ def run_request(track: Track, plan: RunPlan) -> RunRequest:
         actuation_timeout_s=5.0 if plan.lockstep else 0.2,
         held=plan.held,
         exact=plan.exact,
+        pause_s=plan.pause_s,
     )
 
 
@@ -92,8 +96,10 @@ def execute(
     track: Track,
     plan: RunPlan,
     recorder: Recorder | None = None,
+    paused: Callable[[Event], None] = lambda _: None,
 ) -> Event:
     """Announces and starts the run and waits for its end; the plant's ``run_ended`` event.
+    ``paused`` is called at each of its pauses.
 
     How the car was driven is for :func:`bayesrace.operation.analysis.laps.judge`. InputError if
     the controller drives another track, the plant refuses, the recorder fails, or the run ended by
@@ -114,6 +120,7 @@ def execute(
             30.0 + 3.0 * plan.max_time_s,
             absence_s,
             lambda: recorder.failed if recorder else "",
+            paused,
         )
     except RefusedError:  # the plant may be driving for another director
         raise

@@ -22,6 +22,7 @@ from bayesrace.learning.dataset import Dataset
 from bayesrace.learning.sources import dataset_from_columns
 from bayesrace.limit import LimitSettings, known_limit, write_limit
 from bayesrace.manifest import MANIFEST
+from bayesrace.messages import Event
 from bayesrace.operation.analysis.recording import (
     LIMIT_FILES,
     RUN_COLUMNS,
@@ -276,10 +277,25 @@ class Drives:
             options += ["--weights", str(weights)]
         return self._system.controller(options, f"controller-{name}.log")
 
-    def drive(self, controller: str) -> RunPlan:
-        """One run; InputError if it broke off."""
+    def drive(self, controller: str, weights: Path | None = None) -> RunPlan:
+        """One run; InputError if it broke off. With ``weights``, those that it begins with, it
+        takes over updates in its laps."""
         plan = self._plan(controller)
-        self._system.drive(self._prepared.first.track, plan, self._recorder)
+        if weights is None or self._settings.every is None:
+            self._system.drive(self._prepared.first.track, plan, self._recorder)
+            return plan
+
+        newest = weights
+
+        def update(_: Event) -> None:
+            nonlocal newest
+            so_far = [*self._learned_from, self.samples(plan, 0.2)]
+            newest = updated_weights(so_far, self._settings, newest)[0]
+            with suppress(RefusedError):  # the controller's event says why
+                self._system.director.send_weights(newest.read_bytes())
+
+        plan = replace(plan, pause_s=self._settings.every)
+        self._system.drive(self._prepared.first.track, plan, self._recorder, update)
         return plan
 
     def learn(self) -> Path | None:
@@ -289,7 +305,7 @@ class Drives:
         with self._stages.stage("drive WorstCase"):
             driven = self.drive("worstcase")
         with self._stages.stage("drive BayesRace"):
-            first = self._drive_with(weights, "bayesrace")
+            first = self._drive_with(weights, "bayesrace", learns=True)
         updated = self._updated(first or driven, weights, "weights-updated.bin")
         with self._stages.stage("drive BayesRace-updated"):
             if self._drive_with(updated, "bayesrace-updated") is not None:
@@ -309,9 +325,10 @@ class Drives:
             if driven is None:
                 return
 
-    def samples(self, plan: RunPlan) -> Dataset:
-        """What can be learned from a run, from the log; InputError names both."""
-        self._recorder.drain(at_most_s=20.0)
+    def samples(self, plan: RunPlan, at_most_s: float = 20.0) -> Dataset:
+        """What can be learned from a run, from the log, which is waited for so long at most;
+        InputError names both."""
+        self._recorder.drain(at_most_s=at_most_s)
         named = f"{self._out / _LOG}, run {plan.run} ({plan.controller})"
         record = runs_of(self.log.read()).get(plan.run)
         if record is None:
@@ -332,14 +349,15 @@ class Drives:
             self._run, controller, settings.laps, limit_s, lockstep, start_mps, exact=exact
         )
 
-    def _drive_with(self, weights: Path, controller: str) -> RunPlan | None:
-        """One run with new weights; None, and the reason in the log, if they are refused."""
+    def _drive_with(self, weights: Path, controller: str, learns: bool = False) -> RunPlan | None:
+        """One run with new weights; None, and the reason in the log, if they are refused.
+        ``learns``: it takes over updates in its laps, if the settings want that."""
         try:
             self._system.director.send_weights(weights.read_bytes())
         except RefusedError as refusal:
             self._system.refused(self._plan(controller), refusal.reply.text)
             return None
-        return self.drive(controller)
+        return self.drive(controller, weights if learns else None)
 
     def _updated(self, driven: RunPlan, weights: Path, name: str, number: str = "") -> Path:
         """Weights learned from a run and all samples before it, beginning with ``weights``."""

@@ -138,6 +138,13 @@ class RaceSettings(PreparationSettings):
         None, description="racing line to drive, as 'bayesrace raceline' writes it; None: computed"
     )
     laps: int = Field(2, ge=1, le=100, description="laps of a controller, the first from rest")
+    every: float | None = Field(
+        None,
+        ge=2,
+        le=3600,
+        description="time after which BayesRace takes over an update, in its lap, again and again "
+        "[s]; None: it drives with its first weights to the end, and only BayesRace-updated learns",
+    )
     progress_drives: int | None = Field(
         None,
         ge=0,

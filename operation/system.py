@@ -12,7 +12,7 @@ import os
 import signal
 import subprocess
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, Final
@@ -162,10 +162,16 @@ class System:
             words = [str(error), *endings(self.children.values())]
             raise InputError("; ".join(words)) from error
 
-    def drive(self, track: Track, plan: RunPlan, recorder: Recorder | None = None) -> Event:
+    def drive(
+        self,
+        track: Track,
+        plan: RunPlan,
+        recorder: Recorder | None = None,
+        paused: Callable[[Event], None] = lambda _: None,
+    ) -> Event:
         """Drives one run to its end; see :func:`bayesrace.operation.drive.execute`."""
         self._wait_for_recording()
-        return execute(self.director, self._events, track, plan, recorder)
+        return execute(self.director, self._events, track, plan, recorder, paused)
 
     def refused(self, plan: RunPlan, reason: str) -> None:
         """Records that a run is not driven, because the controller refuses its weights."""

@@ -14,6 +14,7 @@ from bayesrace.messages import (
     ACTUATION,
     BRAKING,
     EVENT,
+    GO_ON,
     RUN,
     STATE,
     STATUS,
@@ -55,6 +56,9 @@ _ABANDONED_S = 10.0
 _SPARE_S = 2.0
 """How long after a run the next one may follow, which links that are opened anew would hold up."""
 
+_PAUSE_S = 600.0
+"""A run that waits for so long to go on ends."""
+
 _RELINKED_S = 2.0
 """After a suspension links are there again in less."""
 
@@ -79,7 +83,7 @@ class PlantProcess:
         self._run_number = 0
         self._runs = 0
         self._text = f"no run so far with {_played_by(settings, vehicle)}"
-        self._stopping = False
+        self._stopping = self._pauses = False
         self._spare_s = 0.0
         """From when on links may be opened anew."""
         self._director_gone_ns: int | None = None
@@ -90,7 +94,7 @@ class PlantProcess:
         inbox = self.inbox = Inbox(session, self.name)
         self._decoder = inbox.subscribe(ACTUATION, newest=NEWEST, logger=_log)
         inbox.subscribe(BRAKING, newest=1, logger=_log)
-        for service in (RUN, STOP):
+        for service in (RUN, STOP, GO_ON):
             inbox.serve(service)
         inbox.serve(STATUS, "plant")
         inbox.watch("controller")
@@ -169,6 +173,7 @@ class PlantProcess:
                 numbering=self._numbering,
                 react=self._react,
                 beat=self._beat,
+                pause=self._pause,
                 suspended=self._suspended,
                 hold=self._hold,
                 epoch=self._epoch,
@@ -243,12 +248,37 @@ class PlantProcess:
             request.answer(self._status())
             return None
         message, why_not = decode_request(request)
+        if request.service is GO_ON:
+            waited = message is not None and self._pauses
+            self._pauses &= not waited
+            request.reply(waited, why_not or (self._text if waited else "no run waits to go on"))
+            return None
         if message is None or self._run is None:
             request.reply(False, why_not or "no run to stop")
             return None
         of = f" of '{request.sender}'" if request.sender else ""
         request.reply(True, f"run {self._run_number} stops")
         return End("stopped", f"stopped on request{of}: {message.text}")
+
+    def _pause(self, waits: bool) -> End | None:
+        """Reports a pause of the run, and waits, if so, until it may go on; what ends the run."""
+        time_s = 0.0 if self._run is None else self._run.time_s
+        words = f"run {self._run_number} {'waits' if waits else 'is'} at {time_s:.2f} s"
+        self._pauses = waits
+        self._publish_event("pause", words, {"time_s": time_s, "waits": waits})
+        deadline = time.monotonic() + _PAUSE_S
+        end: End | None = None
+        while self._pauses and end is None:
+            item = self.inbox.get(HEARTBEAT_S)
+            if item is not None and item.kind is Kind.GONE and item.name == "controller":
+                end = End("controller_lost", "the controller vanished: killed or unreachable")
+            elif item is not None and item.kind is not Kind.MESSAGE:
+                end = self._react(item)
+            if end is None and time.monotonic() > deadline:
+                end = End("abandoned", f"for {_PAUSE_S:g} s nobody has told it to go on")
+            end = end or self._beat()
+        self._pauses = False
+        return end
 
     def _publish_event(self, kind: str, text: str, data: Mapping[str, Scalar]) -> None:
         now_ns = time.monotonic_ns()

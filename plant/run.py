@@ -29,6 +29,9 @@ _LONGEST_S: Final = 0.1
 _MOST_DELAYS: Final = 64
 """Rows of ``State.actuation_delays`` that one message has room for."""
 
+_ROUNDING_S: Final = 1e-9
+"""Of plant time."""
+
 _STANDING_MPS: Final = 0.02
 _STOPPING_S: Final = 10.0
 """How long a car that is stopped may take to stand."""
@@ -80,6 +83,9 @@ class Run:
     returns, if anything, ends the run."""
     beat: Callable[[], End | None]
     """Called once a period; what it returns ends the run, too."""
+    pause: Callable[[bool], End | None]
+    """Called after each :attr:`.RunRequest.pause_s`, with whether to wait until the run may go on;
+    what it returns ends the run, too."""
     suspended: Callable[[float], None]
     """Called when the process has not run for so many seconds in real time."""
     hold: HoldWatch
@@ -94,6 +100,7 @@ class Run:
         played = self.sensors, 2 * self.delay_s, self.seed
         self._car = CarRun(self.request, self.simulator, self.epoch, *played)
         self._delay_ns = round(self.delay_s * 1e9)
+        self._pauses = 0
         # In real time:
         self._outbox: deque[tuple[int, State, tuple[float, ...]]] = deque()
         self._sampled_ns: dict[int, int] = {}
@@ -123,11 +130,19 @@ class Run:
             self.inbox.spin_s = LOCKSTEP_SPIN_S
             try:
                 first = self.states.next_seq
-                return drive_lockstep(self._car, first, self._exchange, self.beat)
+                return drive_lockstep(self._car, first, self._exchange, self._between)
             finally:
                 self.inbox.spin_s = 0.0
         with self.inbox.stamped():
             return self._real_time()
+
+    def _between(self) -> End | None:
+        """Once a period."""
+        end, pause_s = self.beat(), self.request.pause_s
+        if end is None and 0 < pause_s * (self._pauses + 1) <= self.time_s + _ROUNDING_S:
+            self._pauses += 1
+            end = self.pause(self.request.lockstep)
+        return end
 
     def _send(self, state: State, x: tuple[float, ...]) -> None:
         """The truth goes second: it must not delay the measurement. Of a real car there is none."""
@@ -205,7 +220,7 @@ class Run:
                 if self._outbox:
                     self._sleep_and_send(self._outbox[-1][0])
                 return end
-            end = self.beat()
+            end = self._between()
             if self._over is None and (end := self._halting(end)) is not None:
                 return end
 

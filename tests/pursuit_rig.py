@@ -77,6 +77,7 @@ def request(run: int, **changes: Any) -> RunRequest:
         "lockstep": True, "x0": x0, "line_x_m": 2.0, "line_y_m": 0.0,
         "line_heading_rad": math.pi / 2, "line_left_m": 0.3, "line_right_m": 0.3, "laps": 1,
         "max_time_s": 60.0, "actuation_timeout_s": 5.0, "held": False, "exact": False,
+        "pause_s": 0.0,
     }  # fmt: skip
     return RunRequest(seq=0, source_time_ns=time.monotonic_ns(), run=run, **(values | changes))
 

@@ -20,7 +20,7 @@ import pytest
 
 from bayesrace.errors import InputError
 from bayesrace.log import LogReader
-from bayesrace.messages import ACTUATION, EVENT, STATE, TELEMETRY
+from bayesrace.messages import ACTUATION, EVENT, STATE, TELEMETRY, Event
 from bayesrace.recorder import Recorder
 from bayesrace.transport import Endpoints, Inbox, open_session
 from tests.car_fmu import packed_car
@@ -103,6 +103,40 @@ def test_the_log_of_a_lockstep_run_is_complete(rig: Rig, tmp_path: Path) -> None
         assert after.u_applied == pytest.approx(answered[before.seq].u, abs=1e-12)
     assert {t.state_seq for t in log.select(TELEMETRY)} >= {s.seq for s in states[:-1]}
     assert [e.kind for e in log.select(EVENT)] == ["run_started", "run_ended"]
+
+
+def test_a_run_that_waits_for_its_director_goes_on_as_if_it_had_not(
+    rig: Rig, tmp_path: Path
+) -> None:
+    """Also where it takes longer than the controller expects a state."""
+    logs, waited_s = [], list[float]()
+
+    def paused(event: Event) -> None:
+        waited_s.append(float(event.data["time_s"]))
+        assert event.data["waits"] is True
+        assert rig.director.status("plant").phase == "running"
+        time.sleep(1.2 * (len(waited_s) == 2))
+
+    for pause_s in (0.0, 0.5):
+        log = tmp_path / f"{pause_s}.mcap"
+        with Recorder(rig.session, "orca", log):
+            rig.director.wait_for(("plant", "controller"), PATIENCE_S)
+            run = rig.start(laps=0, max_time_s=1.9, pause_s=pause_s)
+            assert rig.director.wait_for_end(run, 60.0, paused=paused).data["reason"] == "max_time"
+        logs.append([(one.x, one.u_applied) for one in LogReader(log).select(STATE)])
+    assert waited_s == pytest.approx([0.5, 1.0, 1.5])
+    assert logs[0] == logs[1]
+
+
+def test_a_run_that_waits_for_its_director_can_be_stopped(rig: Rig) -> None:
+    run = rig.start(laps=0, pause_s=0.5)
+
+    def paused(_: Event) -> None:
+        assert rig.director.stop("enough").accepted
+
+    end = rig.director.wait_for_end(run, 60.0, paused=paused)
+    assert end.data["reason"] == "stopped"
+    assert end.data["time_s"] == pytest.approx(0.5)
 
 
 @pytest.mark.wall_clock

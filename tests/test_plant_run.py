@@ -129,13 +129,15 @@ def run_with(
         actuation_timeout_s=0.1,
         held=True,
         exact=False,
+        pause_s=0.0,
     )
     run = Run(
         request=request, simulator=simulator, inbox=cast(Inbox, controller),
         states=cast(Publisher[State], controller),
         truths=cast(Publisher[Truth], controller), decoder=Decoder(Actuation), counters=counters,
         numbering=Numbering(), react=controller.react, beat=lambda: None, epoch=EPOCH,
-        suspended=suspensions.append, delay_s=delay_s, hold=cast(HoldWatch, hold),
+        pause=lambda _: None, suspended=suspensions.append, delay_s=delay_s,
+        hold=cast(HoldWatch, hold),
     )  # fmt: skip
     end = run.execute()
     assert len(suspensions) == counters.suspended

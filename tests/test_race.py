@@ -215,6 +215,16 @@ def test_a_refusal_is_a_row_and_the_race_goes_on(
     assert laps["bestcase"].finished
 
 
+@pytest.mark.check
+def test_updates_within_the_lap_are_those_of_every_race_of_the_seed(short: ShortRace) -> None:
+    races = [short(f"every {i}", "--every", "2", "--progress-drives", "0")() for i in range(2)]
+    one, other = (race.lap("bayesrace") for race in races)
+    versions = one["weights_version"].split(" → ")
+    assert len(versions) == int(one["lap_times_s"][0] + one["lap_times_s"][1]) // 2 + 1
+    assert (one["passed"], one["remarks"]) == (True, [])
+    assert one["trajectory_sha256"] == other["trajectory_sha256"]
+
+
 def test_the_run_directory_is_whole(peanut_race: Race) -> None:
     names = {path.name for path in peanut_race.out.iterdir()}
     wanted = {"settings.json", "run.mcap", "result.json", "report.html", "collect.mcap"}

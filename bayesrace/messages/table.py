@@ -17,6 +17,7 @@ from bayesrace.messages.types import (
     BrakingPlan,
     Command,
     Event,
+    GoOnRequest,
     Hold,
     Message,
     Reply,
@@ -31,9 +32,9 @@ from bayesrace.messages.types import (
 )
 
 __all__ = [
-    "ACTUATION", "ALIVE", "ALIVE_SOURCES", "BRAKING", "COMMAND", "EVENT", "EVERYTHING", "HEARTBEAT",
-    "HOLD", "RECORDERS", "ROLE_OF", "ROLLBACK", "RUN", "SERVICES", "STATE", "STATUS", "STOP",
-    "TELEMETRY", "TOPICS", "TRUTH", "WEIGHTS", "Qos", "Role", "Service", "Source", "Topic",
+    "ACTUATION", "ALIVE", "ALIVE_SOURCES", "BRAKING", "COMMAND", "EVENT", "EVERYTHING", "GO_ON",
+    "HEARTBEAT", "HOLD", "RECORDERS", "ROLE_OF", "ROLLBACK", "RUN", "SERVICES", "STATE", "STATUS",
+    "STOP", "TELEMETRY", "TOPICS", "TRUTH", "WEIGHTS", "Qos", "Role", "Service", "Source", "Topic",
     "car_key", "is_car_name", "topic_of",
 ]  # fmt: skip
 
@@ -157,6 +158,10 @@ STOP: Final = Service(
     "stop", "bayesrace/{car}/plant/stop", StopRequest, Reply, ("plant",), ("director",), 5.0, False,
     urgent=True,
 )  # fmt: skip
+GO_ON: Final = Service(
+    "go_on", "bayesrace/{car}/plant/go_on", GoOnRequest, Reply, ("plant",), ("director",), 5.0,
+    False, urgent=True,
+)  # fmt: skip
 STATUS: Final = Service(
     "status", "bayesrace/{car}/{source}/status", StatusRequest, Status, ("plant", "controller"),
     ("plant", *_WATCHING), 5.0, shared=True,
@@ -177,7 +182,7 @@ COMMAND: Final = Service(
     ("director",), 5.0, urgent=True,
 )  # fmt: skip
 SERVICES: Final[tuple[Service[Any, Any], ...]] = (
-    RUN, STOP, STATUS, WEIGHTS, ROLLBACK, COMMAND
+    RUN, STOP, GO_ON, STATUS, WEIGHTS, ROLLBACK, COMMAND
 )  # fmt: skip
 
 ALIVE: Final = "bayesrace/{car}/alive/{source}/*"

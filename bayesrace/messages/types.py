@@ -16,9 +16,9 @@ from msgspec import Meta, Struct
 __all__ = [
     "BRAKING_ROWS", "END_REASONS", "ESTIMATED", "MOST_INSTRUMENTS", "MOST_READINGS",
     "NOT_REPORTED", "PHASES", "QUANTITIES", "SENSOR_FAULTS", "Actuation", "BrakingPlan",
-    "CarSample", "Command", "Event", "Hold", "Message", "Reading", "Reply", "RollbackRequest",
-    "RunRequest", "Scalar", "State", "Status", "StatusRequest", "StopRequest", "Telemetry",
-    "Truth",
+    "CarSample", "Command", "Event", "GoOnRequest", "Hold", "Message", "Reading", "Reply",
+    "RollbackRequest", "RunRequest", "Scalar", "State", "Status", "StatusRequest", "StopRequest",
+    "Telemetry", "Truth",
 ]  # fmt: skip
 
 END_REASONS: Final = (
@@ -340,7 +340,7 @@ class Hold(Message, frozen=True, kw_only=True):
     """Of the run, as in its states."""
 
 
-class RunRequest(Message, frozen=True, kw_only=True, tag=3):
+class RunRequest(Message, frozen=True, kw_only=True, tag=4):
     """Request on ``bayesrace/{car}/plant/run`` to start a run; the answer is a :class:`Reply`."""
 
     run: Count
@@ -366,6 +366,9 @@ class RunRequest(Message, frozen=True, kw_only=True, tag=3):
     exact: bool
     """States of a simulated car are measured as a whole, as BestCase knows them, whatever its
     sensors."""
+    pause_s: Annotated[float, Meta(ge=0.0, le=1e6)]
+    """After each such time the plant reports a ``pause`` event. In lockstep it then waits for
+    :class:`GoOnRequest`; in real time it drives on. 0: never."""
 
 
 class StopRequest(Message, frozen=True, kw_only=True):
@@ -373,6 +376,11 @@ class StopRequest(Message, frozen=True, kw_only=True):
 
     text: Long
     """The reason, for the ``run_ended`` event."""
+
+
+class GoOnRequest(Message, frozen=True, kw_only=True):
+    """Request on ``bayesrace/{car}/plant/go_on`` to end the pause of a lockstep run; the answer is
+    a :class:`Reply`."""
 
 
 class StatusRequest(Message, frozen=True, kw_only=True):

@@ -8,11 +8,13 @@ from typing import Any, Final
 from bayesrace.errors import InputError
 from bayesrace.messages import (
     EVENT,
+    GO_ON,
     HOLD,
     RUN,
     STATUS,
     STOP,
     Event,
+    GoOnRequest,
     Hold,
     Reply,
     RunRequest,
@@ -153,12 +155,15 @@ class Director:
         timeout_s: float,
         absence_s: float = 1.0,
         trouble: Callable[[], str] = str,
+        paused: Callable[[Event], None] = lambda _: None,
     ) -> Event:
         """The ``run_ended`` event of a run.
 
         In lockstep the plant ends the run itself when the controller disappears; in real time it
         brakes and goes on. A process, or the link to it, may be away for ``absence_s``.
         ``trouble``: a reason to stop waiting, such as a log that cannot be written; empty without.
+        ``paused``: called at each ``pause`` event, after which a run that waits goes on; its
+        duration does not count.
         Raises InputError for such a reason, after an absence or the timeout; KeyboardInterrupt on a
         signal.
         """
@@ -167,11 +172,7 @@ class Director:
         returned = False
         with self.inbox.receive_signals():
             while (left_s := deadline - time.monotonic()) > 0:
-                waits_s, begin_s = min(left_s, self._hold()), time.monotonic()
-                item = self.inbox.get(waits_s)
-                if (late_s := time.monotonic() - begin_s - waits_s) > SUSPENDED_S:
-                    _log.warning("%s; %s", suspension(late_s), _AFTER_SUSPENSION)
-                    deadline, last = deadline + late_s, last + late_s
+                item, passed_s = self._next(min(left_s, self._hold()))
                 if why_not := trouble():
                     raise InputError(f"run {run} is aborted: {why_not}")
                 _raise_on_signal(item)
@@ -179,21 +180,42 @@ class Director:
                     if returned:
                         self._check_running(run)
                     returned = False
-                    continue
-                if item.kind is Kind.GONE:
+                elif item.kind is Kind.GONE:
                     lost.add(item.name)
                     deadline = min(deadline, time.monotonic() + absence_s)
                 elif item.kind is Kind.ALIVE:
                     returned |= item.name == "plant" and item.name in lost
                     lost.discard(item.name)
                     deadline = deadline if lost else last
-                event = item.value
-                if isinstance(event, Event) and (event.run, event.kind) == (run, "run_ended"):
-                    return event
+                elif isinstance(item.value, Event) and item.value.run == run:
+                    if item.value.kind == "run_ended":
+                        return item.value
+                    passed_s += self._pause(item.value, paused)
+                deadline, last = deadline + passed_s, last + passed_s
         if lost:
             gone = " and ".join(f"the {one} of car '{self._car}' vanished" for one in sorted(lost))
             raise InputError(f"{gone} during run {run}")
         raise InputError(f"run {run} of car '{self._car}' did not end in {timeout_s:g} s")
+
+    def _next(self, waits_s: float) -> tuple[Item | None, float]:
+        """What comes in that time, if anything; and how long the machine slept meanwhile [s]."""
+        begin_s = time.monotonic()
+        item = self.inbox.get(waits_s)
+        if (late_s := time.monotonic() - begin_s - waits_s) <= SUSPENDED_S:
+            return item, 0.0
+        _log.warning("%s; %s", suspension(late_s), _AFTER_SUSPENSION)
+        return item, late_s
+
+    def _pause(self, event: Event, paused: Callable[[Event], None]) -> float:
+        """What is to be done in a pause of the run, after which it goes on; its duration [s]."""
+        if event.kind != "pause":
+            return 0.0
+        begin_s = time.monotonic()
+        paused(event)
+        if event.data.get("waits"):  # refused where the run has ended meanwhile
+            request = GoOnRequest(seq=0, source_time_ns=time.monotonic_ns())
+            ask(self._session, GO_ON, self._car, request)
+        return time.monotonic() - begin_s
 
     def _hold(self) -> float:
         """Holds the run, if that is due; how long the loop that follows it may wait now [s]."""

@@ -46,8 +46,8 @@ _WORKERS: Final = options.value(
 @options_of(
     "bayesrace.operation.settings.RaceSettings",
     "car track train_track line collect_s practice_laps practice_until pursuit.style laps "
-    "problem progress_drives mode mpc.constraints mpc.caution seed fmu fmu_map simulator delay_s "
-    "sensors world limit",
+    "every problem progress_drives mode mpc.constraints mpc.caution seed fmu fmu_map simulator "
+    "delay_s sensors world limit",
     file=True,
 )
 def race(

@@ -54,8 +54,8 @@ LEARNS_FROM: Final[Mapping[Controller, tuple[Controller, ...]]] = {
 with the weights of the last one named."""
 
 _FIXED: Final = {
-    "mode", "fmu", "fmu_map", "simulator", "threads", "limit", "line", "discretisation.step_s",
-    "pursuit.step_s", "pursuit.seed",
+    "mode", "every", "fmu", "fmu_map", "simulator", "threads", "limit", "line",
+    "discretisation.step_s", "pursuit.step_s", "pursuit.seed",
 }  # fmt: skip
 """Settings that a campaign does not vary: it drives the built-in car in lockstep, in the plant's
 period, and ``seed`` is the one seed."""
