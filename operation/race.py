@@ -285,14 +285,12 @@ class Drives:
             self._system.drive(self._prepared.first.track, plan, self._recorder)
             return plan
 
-        newest = weights
-
         def update(_: Event) -> None:
-            nonlocal newest
+            """From the weights before the run on: what they miss shows a car that has changed."""
             so_far = [*self._learned_from, self.samples(plan, 0.2)]
-            newest = updated_weights(so_far, self._settings, newest)[0]
+            learned, _samples = updated_weights(so_far, self._settings, weights)
             with suppress(RefusedError):  # the controller's event says why
-                self._system.director.send_weights(newest.read_bytes())
+                self._system.director.send_weights(learned.read_bytes())
 
         plan = replace(plan, pause_s=self._settings.every)
         self._system.drive(self._prepared.first.track, plan, self._recorder, update)

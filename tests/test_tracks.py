@@ -25,7 +25,7 @@ from bayesrace.tracks import (
     random_track,
 )
 from bayesrace.tracks.checks import clearance_m, find_crossing
-from bayesrace.tracks.spline import fit_arc_length
+from bayesrace.tracks.spline import fit_arc_length, rounded_polygon
 from tests.reference import reference_file
 from tests.test_raceline import circle, ring
 
@@ -139,6 +139,20 @@ def test_path_projection_follows_a_weaving_car_for_laps(
     np.testing.assert_allclose(path.s_m, np.mod(s, track.length_m), atol=1e-6)
     np.testing.assert_allclose(path.n_m, n, atol=1e-6)
     np.testing.assert_allclose(np.diff(path.progress_m), np.diff(s), atol=1e-6)
+
+
+def test_a_car_inside_a_bend_tighter_than_the_track_is_wide_is_on_it() -> None:
+    """Past the diagonal it is beside the piece after the bend, though still near that before."""
+    corners = [(0, 0, 0.1), (2, 0, 0.1), (2, 2, 0.1), (0, 2, 0.1)]
+    points = rounded_polygon(corners, 0.02, 0.02)
+    assert points is not None
+    track = Track.from_points("square", points, 0.25, 0.25)
+    side = np.column_stack([np.arange(0.24, 1.76, 0.02), np.full(76, 0.24)])
+    xy = np.concatenate([side, np.array([2, 0]) + side[:, ::-1] * [-1, 1]])
+    path = track.project_path(xy)
+    nearest = track.project_points(xy)
+    np.testing.assert_allclose(path.off_track_m, nearest.off_track_m, atol=1e-9)
+    assert (path.off_track_m < 0).all()
 
 
 def test_path_projection_finds_the_way_back_after_a_gap() -> None:

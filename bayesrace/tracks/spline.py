@@ -208,7 +208,22 @@ class CentrelineSearch:
                 s = self._nearest_chunk(points[k : k + 1])
                 at = round(float(s[0]) / self._step) % self._count
             samples[k] = at
-        return self._refine(points, samples)
+        return self._refine(points, self._nearest_beside(points, samples, reach))
+
+    def _nearest_beside(self, points: Floats, samples: np.ndarray, reach: float) -> np.ndarray:
+        """Nearest samples of those that are up to 1.5 ``reach`` before and after these.
+
+        Inside a bend that is tighter than the track is wide, the walk stays behind at a local
+        minimum: beside it lies the piece after the bend, where the car is.
+        """
+        most = min(round(1.5 * reach / self._step), self._count // 2)
+        around, found = np.arange(-most, most + 1), samples.copy()
+        for i in range(0, len(points), _CHUNK):
+            near = (samples[i : i + _CHUNK, None] + around) % self._count
+            away = points[i : i + _CHUNK, None] - self._samples[near]
+            lowest = np.argmin(np.sum(away**2, axis=2), axis=1)
+            found[i : i + _CHUNK] = near[np.arange(len(near)), lowest]
+        return found
 
     def _walk(self, x: float, y: float, at: int) -> int:
         """Index of the sample where the distance stops falling, going from ``at``."""
