@@ -12,6 +12,7 @@ from bayesrace.gp.weights import read_weights
 from bayesrace.learning.coverage import NEAR, Coverage, asked, coverage
 from bayesrace.operation.closed_loop import ClosedLoop
 from bayesrace.operation.preparation import Prepared, prepare
+from bayesrace.operation.report.coverage import coverage_figures
 from bayesrace.operation.settings import PreparationSettings
 from bayesrace.operation.terminal.terminal import stages_on
 from bayesrace.operation.training_drives import LARGER, PreparedTrack, larger_course
@@ -65,6 +66,15 @@ def test_the_left_and_the_right_count_as_one_and_lines_by_their_time(on: Prepare
     faster = offset_line(load_track("random:4"), 0.0, 5.0, 3.0)
     both, alone = coverage([on.line, faster], x).share, coverage([faster], x).share
     assert alone < both < 1
+
+
+def test_the_report_shows_where_the_line_asks_for_what_was_not_driven(on: PreparedTrack) -> None:
+    track, line = on.track, on.line
+    fast, slow = coverage([line], driving(line)), coverage([line], driving(line)[:30])
+    assert len(coverage_figures(fast, track, line)) == 1
+    _, where = coverage_figures(slow, track, line)
+    (marked,) = [one for one in where.axes[0].lines if one.get_label() == "not driven before"]
+    np.testing.assert_allclose(np.transpose(marked.get_data()), line.xy_m[~slow.near])
 
 
 def test_the_smallest_larger_copy_that_has_what_is_missing_is_chosen(

@@ -167,7 +167,9 @@ def test_no_lap_is_faster_than_the_limit(peanut_race: Race) -> None:
 
 
 def test_the_weights_are_swapped_in_the_running_controller(peanut_race: Race) -> None:
-    versions = [peanut_race.lap(name)["weights_version"] for name in CONTROLLERS]
+    laps = [peanut_race.lap(name) for name in CONTROLLERS]
+    versions = [lap["weights_version"] for lap in laps]
+    assert [lap["unknown_s"] is None for lap in laps] == [True, False, False, True]
     assert versions[0] == versions[3] == ""
     assert versions[1]
     assert versions[2]

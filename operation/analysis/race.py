@@ -176,6 +176,7 @@ class DrivenRun:
             ended=self.record.ended,
             refused=self.record.plan.refused,
             remarks=self.record.remarks,
+            unknown_s=self.record.unknown_s,
         )
 
     def _largest(self, values: Floats) -> float | None:

@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Final
 
@@ -86,6 +86,9 @@ class RunRecord(Trajectory):
     actuations: Columns
     telemetry: Columns
     events: Columns
+    unknown_s: float | None = field(default=None, kw_only=True)
+    """What a lap loses where the line is faster than what its first weights have learned, by the
+    controller; None without weights."""
 
     @property
     def moments(self) -> Columns:
@@ -153,8 +156,14 @@ def runs_of(log: LogColumns) -> dict[int, RunRecord]:
     found = {plan.run: plan for plan in plans}
     for run in np.unique(np.concatenate([log[topic]["run"] for topic in RUN_COLUMNS])).tolist():
         found.setdefault(run, PlannedRun(run, "", ""))
+    accepted = events["data"][events["kind"] == "weights_accepted"]
+    lost_s = {one.get("version"): one["unknown_s"] for one in accepted if "unknown_s" in one}
     return {
-        run: RunRecord(plan, *(_of_run(log[topic], run) for topic in RUN_COLUMNS))
+        run: RunRecord(
+            plan,
+            *(_of_run(log[topic], run) for topic in RUN_COLUMNS),
+            unknown_s=lost_s.get(plan.weights_version),
+        )
         for run, plan in sorted(found.items())
     }
 

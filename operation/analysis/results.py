@@ -95,6 +95,11 @@ class LapResult(_Frozen):
     remarks: list[str] = Field(
         [], description="of the controller in mid-run: weights rolled back, speed limited"
     )
+    unknown_s: float | None = Field(
+        None,
+        description="what a lap loses where the racing line is faster than what the run's first "
+        "weights have learned; null where the controller has not said so",
+    )
 
     @property
     def fallbacks(self) -> int:

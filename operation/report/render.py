@@ -16,7 +16,7 @@ from bayesrace.files import write_whole
 from bayesrace.manifest import Manifest
 from bayesrace.operation.analysis.race import RaceAnalysis, read_race
 from bayesrace.operation.analysis.results import RaceResult, write_result
-from bayesrace.operation.report.coverage import coverage_figure
+from bayesrace.operation.report.coverage import coverage_figures
 from bayesrace.operation.report.gp import gp_figures
 from bayesrace.operation.report.maps import lap_maps
 from bayesrace.operation.report.panels import lap_figures, solve_figure, time_figures
@@ -157,7 +157,7 @@ def _figures(analysis: RaceAnalysis) -> Iterator[tuple[str, list[Figure]]]:
         for figure in lap_maps([run], on.track, on.line)
     ]  # fmt: skip
     if analysis.coverage is not None:
-        maps.append(coverage_figure(analysis.coverage))
+        maps += coverage_figures(analysis.coverage, track, line)
     if maps:
         yield "training", maps
     if any(len(run.record.telemetry) for run in runs):
