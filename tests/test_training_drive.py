@@ -2,6 +2,7 @@
 
 import io
 import json
+import re
 import shutil
 from dataclasses import replace
 from functools import cache
@@ -202,10 +203,20 @@ def test_a_drive_lasts_a_lap_at_least() -> None:
 
 def test_collect_says_how_the_drive_went(tmp_path: Path, cli: Cli) -> None:
     write_raceline(tmp_path / "line.csv", at_the_edge())
-    options = ("--track", "paddock", "--raceline", "line.csv", "--duration", "2")
+    options = (
+        "--track",
+        "paddock",
+        "--raceline",
+        "line.csv",
+        "--duration",
+        "2",
+        "--for",
+        "line.csv",
+    )
     done = cli("collect", *options, "--style", "calm")
     assert done.code == 0, done.err
     assert "1 drive, 100 samples, 0 of them off the track, up to " in done.out
+    assert re.search(r"^line.csv: \d+ % of the racing line's time is at speeds and", done.out, re.M)
 
 
 def test_practice_ends_where_the_car_leaves_its_track_and_its_log_is_one_to_learn_from(

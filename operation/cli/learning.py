@@ -42,6 +42,12 @@ def collect(
     settings: "Given[PreparationSettings]",
     track: str = options.TRACK_GIVEN,
     raceline: Path = options.RACELINE,
+    race_line: Path | None = options.value(
+        "Racing line to be driven with what is learned: says how much of it was driven.",
+        None,
+        "--for",
+        metavar="FILE",
+    ),
     out: Path = options.out_file(Path("collect.mcap")),
 ) -> None:
     """Drive a track by pure pursuit and log the drive as training data."""
@@ -49,14 +55,16 @@ def collect(
 
     from bayesrace.codegen.build import build
     from bayesrace.codegen.settings import BuildSettings
+    from bayesrace.learning.coverage import coverage
     from bayesrace.operation.training_drives import drive_for_training
-    from bayesrace.raceline import read_raceline_for
+    from bayesrace.raceline import read_raceline, read_raceline_for
     from bayesrace.tracks import load_track
 
     chosen = settings()
     car = chosen.car
     course = load_track(track, car.width_m)
     line = read_raceline_for(raceline, course, car)
+    asked = None if race_line is None else read_raceline(race_line)
     artefact, _ = build(BuildSettings(car=car))
     driven = drive_for_training(chosen, course, line, car, artefact, out)
     x = np.concatenate([one.x[:-1] for one in driven])
@@ -65,6 +73,8 @@ def collect(
         f"{len(driven)} {'drive' if len(driven) == 1 else 'drives'}, {len(x)} samples, "
         f"{int(off_track.sum())} of them off the track, up to {float(x[:, 3].max()):.2f} m/s: {out}"
     )
+    if asked is not None:
+        typer.echo(f"{race_line}: {coverage([asked], x)}")
 
 
 def identify(
