@@ -73,8 +73,9 @@ def test_the_report_shows_where_the_line_asks_for_what_was_not_driven(on: Prepar
     fast, slow = coverage([line], driving(line)), coverage([line], driving(line)[:30])
     assert len(coverage_figures(fast, track, line)) == 1
     _, where = coverage_figures(slow, track, line)
-    (marked,) = [one for one in where.axes[0].lines if one.get_label() == "not driven before"]
-    np.testing.assert_allclose(np.transpose(marked.get_data()), line.xy_m[~slow.near])
+    (marked,) = (one for one in where.axes[0].lines if one.get_label() == "not driven before")
+    shown: Floats = np.array(marked.get_xydata(), dtype=np.float64)
+    np.testing.assert_allclose(shown, line.xy_m[~slow.near])
 
 
 def test_the_smallest_larger_copy_that_has_what_is_missing_is_chosen(
