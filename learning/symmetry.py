@@ -41,10 +41,11 @@ def symmetric(dataset: Dataset, discretisation: Discretisation) -> bool:
     newest = dataset.select(slice(-_NEWEST, None))
     both = newest.select(evenly(len(newest), _LOOKED_AT)).with_mirror_images()
     z, y, deviation = both.features, residual(both, discretisation), both.deviation
-    row = np.arange(len(z)) % 4  # of a sample, its image, the sample to predict, and its image
+    sample, image = np.divmod(np.arange(len(z)), 2)
+    asked, itself = sample % 2 == 1, image == 0
     for output in zip(y.T, deviation.T[:3], strict=True):
         with_images, without = (
-            _density(z, *output, known, row == 2) for known in (row < 2, row == 0)
+            _density(z, *output, known, asked & itself) for known in (~asked, ~asked & itself)
         )
         if with_images < without - _WORSE:
             return False

@@ -40,7 +40,7 @@ class RunPlan:
     exact: bool = False
     """The state is known as it is, whatever the sensors."""
     pause_s: float = 0.0
-    """After each such time there is a pause, see :class:`.RunRequest`; 0: never."""
+    """In lockstep: after each such time the run waits, see :class:`.RunRequest`; 0: never."""
 
 
 def run_request(track: Track, plan: RunPlan) -> RunRequest:
@@ -111,8 +111,10 @@ def execute(
     _check_track(track, controller.track)
     announced = announcement(plan, publisher.next_seq, controller.weights_version)
     publisher.put(announced, lockstep=True)
+    started = False
     try:
         director.start(run_request(track, plan))
+        started = True
         # In lockstep simulated time passes faster than real time, but that is no promise.
         absence_s = 1.0 if plan.lockstep else _ABSENCE_S
         end = director.wait_for_end(
@@ -122,11 +124,11 @@ def execute(
             lambda: recorder.failed if recorder else "",
             paused,
         )
-    except RefusedError:  # the plant may be driving for another director
-        raise
-    except (InputError, KeyboardInterrupt):
-        with suppress(InputError):  # a car must not drive on unwatched
-            director.stop("the process that started the run has ended")
+    except BaseException as error:  # a car must not drive on unwatched
+        # A plant that has refused may be driving for another director.
+        if started or not isinstance(error, RefusedError):
+            with suppress(InputError):
+                director.stop("the process that started the run has ended")
         raise
     if end.data.get("reason") not in _REGULAR:
         raise InputError(f"run {plan.run} ({plan.controller}) ended early: {end.text}")

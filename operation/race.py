@@ -4,6 +4,7 @@ Plant and controller are processes of their own, started as a person would start
 directs, records every message on the network, and hands over weights.
 """
 
+import logging
 import os
 import shutil
 import time
@@ -60,6 +61,8 @@ _PATIENCE_S: Final = 60.0
 """For the limits, once all else is prepared."""
 
 _LOWEST: Final = 19
+
+_log = logging.getLogger("bayesrace.race")
 
 _LOG: Final = "run.mcap"
 _CAR: Final = "car.toml"
@@ -277,24 +280,34 @@ class Drives:
             options += ["--weights", str(weights)]
         return self._system.controller(options, f"controller-{name}.log")
 
-    def drive(self, controller: str, weights: Path | None = None) -> RunPlan:
-        """One run; InputError if it broke off. With ``weights``, those that it begins with, it
-        takes over updates in its laps."""
+    def drive(self, controller: str) -> RunPlan:
+        """One run; InputError if it broke off."""
         plan = self._plan(controller)
-        if weights is None or self._settings.every is None:
-            self._system.drive(self._prepared.first.track, plan, self._recorder)
-            return plan
+        self._system.drive(self._prepared.first.track, plan, self._recorder)
+        return plan
+
+    def _drive_learning(self, weights: Path, controller: str) -> tuple[RunPlan, Path]:
+        """One run that takes over an update each time the settings say so; with the last weights
+        that the controller has accepted, after ``weights``."""
+        accepted = weights
 
         def update(_: Event) -> None:
-            """From the weights before the run on: what they miss shows a car that has changed."""
-            so_far = [*self._learned_from, self.samples(plan, 0.2)]
-            learned, _samples = updated_weights(so_far, self._settings, weights)
-            with suppress(RefusedError):  # the controller's event says why
+            nonlocal accepted
+            try:
+                # From the weights before the run on: what they miss shows a car that has changed.
+                so_far = [*self._learned_from, self.samples(plan)]
+                learned, _samples = updated_weights(so_far, self._settings, weights)
                 self._system.director.send_weights(learned.read_bytes())
+            except RefusedError as refusal:  # in the log, as the controller's event
+                _log.warning("%s", refusal)
+            except (InputError, ArithmeticError, ValueError) as error:
+                _log.warning("nothing learned within the lap: %s", error)
+            else:
+                accepted = learned
 
-        plan = replace(plan, pause_s=self._settings.every)
+        plan = replace(self._plan(controller), pause_s=self._settings.every or 0.0)
         self._system.drive(self._prepared.first.track, plan, self._recorder, update)
-        return plan
+        return plan, accepted
 
     def learn(self) -> Path | None:
         """WorstCase, BayesRace and BayesRace-updated; returns the last weights that the controller
@@ -303,12 +316,14 @@ class Drives:
         with self._stages.stage("drive WorstCase"):
             driven = self.drive("worstcase")
         with self._stages.stage("drive BayesRace"):
-            first = self._drive_with(weights, "bayesrace", learns=True)
+            first = None
+            if self._accepts(weights, "bayesrace"):
+                first, accepted = self._drive_learning(weights, "bayesrace")
         updated = self._updated(first or driven, weights, "weights-updated.bin")
         with self._stages.stage("drive BayesRace-updated"):
             if self._drive_with(updated, "bayesrace-updated") is not None:
                 return updated
-        return weights if first is not None else None
+        return accepted if first is not None else None
 
     def approach_limit(self, weights: Path) -> None:
         """The runs that maximise progress, the first with the weights that the controller has, with
@@ -323,10 +338,9 @@ class Drives:
             if driven is None:
                 return
 
-    def samples(self, plan: RunPlan, at_most_s: float = 20.0) -> Dataset:
-        """What can be learned from a run, from the log, which is waited for so long at most;
-        InputError names both."""
-        self._recorder.drain(at_most_s=at_most_s)
+    def samples(self, plan: RunPlan) -> Dataset:
+        """What can be learned from a run, from the log; InputError names both."""
+        self._recorder.drain(at_most_s=20.0)
         named = f"{self._out / _LOG}, run {plan.run} ({plan.controller})"
         record = runs_of(self.log.read()).get(plan.run)
         if record is None:
@@ -347,15 +361,18 @@ class Drives:
             self._run, controller, settings.laps, limit_s, lockstep, start_mps, exact=exact
         )
 
-    def _drive_with(self, weights: Path, controller: str, learns: bool = False) -> RunPlan | None:
-        """One run with new weights; None, and the reason in the log, if they are refused.
-        ``learns``: it takes over updates in its laps, if the settings want that."""
+    def _accepts(self, weights: Path, controller: str) -> bool:
+        """Whether the controller takes over new weights; if not, the log has the reason."""
         try:
             self._system.director.send_weights(weights.read_bytes())
         except RefusedError as refusal:
             self._system.refused(self._plan(controller), refusal.reply.text)
-            return None
-        return self.drive(controller, weights if learns else None)
+            return False
+        return True
+
+    def _drive_with(self, weights: Path, controller: str) -> RunPlan | None:
+        """One run with new weights; None if they are refused."""
+        return self.drive(controller) if self._accepts(weights, controller) else None
 
     def _updated(self, driven: RunPlan, weights: Path, name: str, number: str = "") -> Path:
         """Weights learned from a run and all samples before it, beginning with ``weights``."""

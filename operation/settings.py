@@ -142,8 +142,8 @@ class RaceSettings(PreparationSettings):
         None,
         ge=2,
         le=3600,
-        description="time after which BayesRace takes over an update, in its lap, again and again "
-        "[s]; None: it drives with its first weights to the end, and only BayesRace-updated learns",
+        description="time after which BayesRace takes over an update, again and again within its "
+        "laps [s]; in lockstep; None: only BayesRace-updated learns from them",
     )
     progress_drives: int | None = Field(
         None,
@@ -190,6 +190,11 @@ class RaceSettings(PreparationSettings):
         steps = {self.discretisation.step_s, self.pursuit.step_s, PLANT.step_s}
         if len(steps) > 1:
             raise ValueError(f"all parts must share the plant's period of {PLANT.step_s} s")
+        if self.every is not None and self.mode == "realtime":
+            raise ValueError(
+                f"every {self.every:g}: updates within the lap are for lockstep, where the car "
+                "waits for them: leave out --mode realtime, or use 'bayesrace learn --every'"
+            )
         seeded = self.pursuit.model_copy(update={"seed": self.seed})
         object.__setattr__(self, "pursuit", seeded)
         object.__setattr__(self, "track", self.track or self.car.race_track)

@@ -141,6 +141,8 @@ class PlantProcess:
     def _prepare(self, message: RunRequest) -> str:
         """Make the run; returns why it cannot be, or ""."""
         self._director_gone_ns = None  # of a run before
+        if message.pause_s and not message.lockstep:
+            return "a run in real time does not wait: leave out pause_s, or drive in lockstep"
         if self._settings.endpoints.low_latency and not message.lockstep:
             # Without priorities a message that Zenoh drops may be the last of its kind on a link.
             return (
@@ -249,9 +251,10 @@ class PlantProcess:
             return None
         message, why_not = decode_request(request)
         if request.service is GO_ON:
-            waited = message is not None and self._pauses
+            waited = message is not None and self._pauses and message.run == self._run_number
             self._pauses &= not waited
-            request.reply(waited, why_not or (self._text if waited else "no run waits to go on"))
+            words = f"run {self._run_number} goes on" if waited else f"none to go on: {self._text}"
+            request.reply(waited, why_not or words)
             return None
         if message is None or self._run is None:
             request.reply(False, why_not or "no run to stop")
@@ -260,12 +263,12 @@ class PlantProcess:
         request.reply(True, f"run {self._run_number} stops")
         return End("stopped", f"stopped on request{of}: {message.text}")
 
-    def _pause(self, waits: bool) -> End | None:
-        """Reports a pause of the run, and waits, if so, until it may go on; what ends the run."""
+    def _pause(self) -> End | None:
+        """Reports that the run waits, and waits until it may go on; returns what ends it."""
         time_s = 0.0 if self._run is None else self._run.time_s
-        words = f"run {self._run_number} {'waits' if waits else 'is'} at {time_s:.2f} s"
-        self._pauses = waits
-        self._publish_event("pause", words, {"time_s": time_s, "waits": waits})
+        running, self._text = self._text, f"run {self._run_number} waits at {time_s:.2f} s"
+        self._pauses = True
+        self._publish_event("pause", self._text, {"time_s": time_s})
         deadline = time.monotonic() + _PAUSE_S
         end: End | None = None
         while self._pauses and end is None:
@@ -275,9 +278,9 @@ class PlantProcess:
             elif item is not None and item.kind is not Kind.MESSAGE:
                 end = self._react(item)
             if end is None and time.monotonic() > deadline:
-                end = End("abandoned", f"for {_PAUSE_S:g} s nobody has told it to go on")
+                end = End("abandoned", f"nobody has told it to go on for {_PAUSE_S:g} s")
             end = end or self._beat()
-        self._pauses = False
+        self._pauses, self._text = False, running
         return end
 
     def _publish_event(self, kind: str, text: str, data: Mapping[str, Scalar]) -> None:

@@ -83,9 +83,9 @@ class Run:
     returns, if anything, ends the run."""
     beat: Callable[[], End | None]
     """Called once a period; what it returns ends the run, too."""
-    pause: Callable[[bool], End | None]
-    """Called after each :attr:`.RunRequest.pause_s`, with whether to wait until the run may go on;
-    what it returns ends the run, too."""
+    pause: Callable[[], End | None]
+    """Called in lockstep after each :attr:`.RunRequest.pause_s`; returns when the run may go on, or
+    what ends it."""
     suspended: Callable[[float], None]
     """Called when the process has not run for so many seconds in real time."""
     hold: HoldWatch
@@ -130,19 +130,11 @@ class Run:
             self.inbox.spin_s = LOCKSTEP_SPIN_S
             try:
                 first = self.states.next_seq
-                return drive_lockstep(self._car, first, self._exchange, self._between)
+                return drive_lockstep(self._car, first, self._exchange, self._beat_or_pause)
             finally:
                 self.inbox.spin_s = 0.0
         with self.inbox.stamped():
             return self._real_time()
-
-    def _between(self) -> End | None:
-        """Once a period."""
-        end, pause_s = self.beat(), self.request.pause_s
-        if end is None and 0 < pause_s * (self._pauses + 1) <= self.time_s + _ROUNDING_S:
-            self._pauses += 1
-            end = self.pause(self.request.lockstep)
-        return end
 
     def _send(self, state: State, x: tuple[float, ...]) -> None:
         """The truth goes second: it must not delay the measurement. Of a real car there is none."""
@@ -151,6 +143,14 @@ class Run:
             self.truths.put(truth_behind(state, x), lockstep=state.lockstep)
 
     # Lockstep ----------------------------------------------------------------------------------
+
+    def _beat_or_pause(self) -> End | None:
+        """Once a period."""
+        end, pause_s = self.beat(), self.request.pause_s
+        if end is None and 0 < pause_s * (self._pauses + 1) <= self.time_s + _ROUNDING_S:
+            self._pauses += 1
+            end = self.pause()
+        return end
 
     def _exchange(self, state: State, x: tuple[float, ...]) -> tuple[float, ...] | End:
         """Sends the state and waits for its answer; the last one has none."""
@@ -220,7 +220,7 @@ class Run:
                 if self._outbox:
                     self._sleep_and_send(self._outbox[-1][0])
                 return end
-            end = self._between()
+            end = self.beat()
             if self._over is None and (end := self._halting(end)) is not None:
                 return end
 

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 from bayesrace.arrays import Floats
 from bayesrace.codegen.build import build
@@ -19,8 +20,9 @@ from bayesrace.learning.symmetry import symmetric
 from bayesrace.learning.training import perform, train
 from bayesrace.learning.validation import residual
 from bayesrace.operation.closed_loop import ClosedLoop, Driven, built_in_car
-from bayesrace.operation.preparation import Prepared, training_settings, updated_weights
+from bayesrace.operation.preparation import Prepared, prepare, training_settings, updated_weights
 from bayesrace.operation.settings import PreparationSettings
+from bayesrace.operation.terminal.terminal import stages_on
 from bayesrace.plant.simulator import PLANT, Simulator
 from bayesrace.vehicles import default_car
 from bayesrace.vehicles.models import Model, dynamic
@@ -100,6 +102,14 @@ def test_a_car_that_has_changed_and_is_known_again_stays_as_it_is() -> None:
     settings = training_settings(PreparationSettings())
     learned = train(every, PREDICTION, settings, race.weights)
     assert brought_up_to_date(concatenate([every, other]), learned, PREDICTION)[1] == 0
+
+
+@pytest.mark.check
+def test_a_car_on_a_track_that_bends_to_one_side_has_none(peanut_track: Path) -> None:
+    settings = PreparationSettings(train_track=str(peanut_track))
+    with stages_on(Console(quiet=True)) as stages:
+        prepared = prepare(settings, (str(peanut_track),), stages, ("e_kinematic",))
+    assert symmetric(concatenate(prepared.samples), PREDICTION)
 
 
 def test_a_car_with_a_side_is_told_from_one_without() -> None:

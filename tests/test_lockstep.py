@@ -20,10 +20,11 @@ import pytest
 
 from bayesrace.errors import InputError
 from bayesrace.log import LogReader
-from bayesrace.messages import ACTUATION, EVENT, STATE, TELEMETRY, Event
+from bayesrace.messages import ACTUATION, EVENT, GO_ON, STATE, TELEMETRY, Event, GoOnRequest
 from bayesrace.recorder import Recorder
-from bayesrace.transport import Endpoints, Inbox, open_session
+from bayesrace.transport import Endpoints, Inbox, ask, open_session
 from tests.car_fmu import packed_car
+from tests.driven import blank
 from tests.programs import until
 from tests.pursuit_rig import CONTROLLER, PATIENCE_S, PLANT, Rig, running_rig, start
 
@@ -112,9 +113,11 @@ def test_a_run_that_waits_for_its_director_goes_on_as_if_it_had_not(
     logs, waited_s = [], list[float]()
 
     def paused(event: Event) -> None:
-        waited_s.append(float(event.data["time_s"]))
-        assert event.data["waits"] is True
-        assert rig.director.status("plant").phase == "running"
+        now_s = float(event.data["time_s"])
+        waited_s.append(now_s)
+        assert (
+            rig.director.status("plant").text == event.text == f"run {run} waits at {now_s:.2f} s"
+        )
         time.sleep(1.2 * (len(waited_s) == 2))
 
     for pause_s in (0.0, 0.5):
@@ -137,6 +140,13 @@ def test_a_run_that_waits_for_its_director_can_be_stopped(rig: Rig) -> None:
     end = rig.director.wait_for_end(run, 60.0, paused=paused)
     assert end.data["reason"] == "stopped"
     assert end.data["time_s"] == pytest.approx(0.5)
+
+
+def test_a_run_in_real_time_does_not_wait_and_only_one_that_waits_goes_on(rig: Rig) -> None:
+    reply = ask(rig.session, GO_ON, "orca", blank(GoOnRequest, run=1))
+    assert (reply.accepted, reply.text[:16]) == (False, "none to go on: r")
+    with pytest.raises(InputError, match="a run in real time does not wait: leave out pause_s"):
+        rig.start(lockstep=False, laps=0, pause_s=0.5)
 
 
 @pytest.mark.wall_clock
@@ -183,14 +193,22 @@ def test_a_failing_step_goes_down_the_levels_and_the_car_stops(
     assert abs(log.select(STATE)[-1].x[3]) < 0.05
 
 
-def test_a_killed_controller_ends_a_lockstep_run(mortal: Rig, tmp_path: Path) -> None:
+@pytest.mark.parametrize("waits", [False, True])
+def test_a_killed_controller_ends_a_lockstep_run(mortal: Rig, tmp_path: Path, waits: bool) -> None:
+    """Also one that waits for its director."""
     rig = mortal
+
+    def killed(_: Event) -> None:
+        rig.controller.kill()
+        rig.wait_for_phase("plant", "idle")
+
     with Recorder(rig.session, "orca", tmp_path / "log.mcap"):
         rig.director.wait_for(("plant",), PATIENCE_S)
-        run = rig.start(laps=0, max_time_s=1e5)
-        rig.wait_until_driving(run)
-        rig.controller.kill()
-        end = rig.director.wait_for_end(run, PATIENCE_S, absence_s=PATIENCE_S)
+        run = rig.start(laps=0, max_time_s=1e5, pause_s=0.5 * waits)
+        if not waits:
+            rig.wait_until_driving(run)
+            rig.controller.kill()
+        end = rig.director.wait_for_end(run, PATIENCE_S, absence_s=PATIENCE_S, paused=killed)
     assert end.data["reason"] == "controller_lost"
     assert "controller vanished" in end.text
     states = LogReader(tmp_path / "log.mcap").select(STATE)

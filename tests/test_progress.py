@@ -244,4 +244,5 @@ def test_a_car_that_points_back_turns_and_drives_on(
         if turned and (follows == 1).all():
             fastest_mps = max(fastest_mps, x[3])
     assert turned
-    assert fastest_mps > 2.0
+    assert fastest_mps > 2.0  # it goes on to slide, and may follow its line for that: not judged
+    assert x[3] > 0.8

@@ -217,6 +217,37 @@ def test_a_refusal_is_a_row_and_the_race_goes_on(
     assert laps["bestcase"].finished
 
 
+def test_updates_within_the_lap_are_refused_in_real_time(cli: Cli, tmp_path: Path) -> None:
+    done = cli("race", "--every", "2", "--mode", "realtime", "--out", tmp_path / "out")
+    refused(done, "updates within the lap are for lockstep", "bayesrace learn --every")
+
+
+@pytest.mark.check
+def test_an_update_within_the_lap_may_fail_or_be_refused_and_the_race_goes_on(
+    peanut_track: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    updates = list[int]()
+
+    def learn(*arguments: Any) -> tuple[Path, Dataset]:
+        updates.append(len(updates))
+        if len(updates) == 1:
+            raise np.linalg.LinAlgError("singular")
+        weights, samples = updated_weights(*arguments)
+        return absurd(weights, tmp_path / "absurd.bin") if len(updates) == 2 else weights, samples
+
+    monkeypatch.setattr(driving, "updated_weights", learn)
+    track = str(peanut_track)
+    settings = RaceSettings(track=track, train_track=track, progress_drives=0, every=2, laps=3)
+    with stages_on(Console(quiet=True)) as stages:
+        driving.race(settings, tmp_path / "out", stages)
+    laps = {lap.controller: lap for lap in analyse(tmp_path / "out").laps}
+    versions = laps["bayesrace"].weights_version.split(" → ")
+    assert len(updates) >= 4  # the last one is that after the run
+    assert len(versions) == len(updates) - 2
+    assert laps["bayesrace"].passed
+    assert laps["bayesrace-updated"].passed
+
+
 @pytest.mark.check
 def test_updates_within_the_lap_are_those_of_every_race_of_the_seed(short: ShortRace) -> None:
     races = [short(f"every {i}", "--every", "2", "--progress-drives", "0")() for i in range(2)]

@@ -28,8 +28,9 @@ END_REASONS: Final = (
 """Why a run ended: ``reason`` in the data of the ``run_ended`` event.
 
 plant_fault: the simulated car failed, and its last good state is repeated as the final one.
-abandoned: the client that started the run was away for too long. several_controllers: at its
-regular end the run had more than one controller, so its actuations cannot be attributed.
+abandoned: the client that started the run was away for too long, or left it waiting in a pause.
+several_controllers: at its regular end the run had more than one controller, so its actuations
+cannot be attributed.
 hold_lost: the plant stopped the car, because the director of the held run was missing."""
 
 PHASES: Final = ("idle", "running", "waiting", "ready", "driving", "fallback", "stopped")
@@ -367,8 +368,8 @@ class RunRequest(Message, frozen=True, kw_only=True, tag=4):
     """States of a simulated car are measured as a whole, as BestCase knows them, whatever its
     sensors."""
     pause_s: Annotated[float, Meta(ge=0.0, le=1e6)]
-    """After each such time the plant reports a ``pause`` event. In lockstep it then waits for
-    :class:`GoOnRequest`; in real time it drives on. 0: never."""
+    """In lockstep: after each such time the plant reports a ``pause`` event and waits for
+    :class:`GoOnRequest`. 0: never."""
 
 
 class StopRequest(Message, frozen=True, kw_only=True):
@@ -381,6 +382,9 @@ class StopRequest(Message, frozen=True, kw_only=True):
 class GoOnRequest(Message, frozen=True, kw_only=True):
     """Request on ``bayesrace/{car}/plant/go_on`` to end the pause of a lockstep run; the answer is
     a :class:`Reply`."""
+
+    run: Count
+    """That waits."""
 
 
 class StatusRequest(Message, frozen=True, kw_only=True):

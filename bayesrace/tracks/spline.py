@@ -27,6 +27,7 @@ __all__ = [
 ]
 
 _GAUSS_X, _GAUSS_W = np.polynomial.legendre.leggauss(5)
+_BESIDE = 1.5  # track widths: the way round a point on the edge is pi / 2 of half of one
 _CHUNK = 256  # query points per distance matrix, bounds its memory
 _MAX_SAMPLES = 20_000
 _NODES_A_WIDTH: Final = 6
@@ -211,12 +212,13 @@ class CentrelineSearch:
         return self._refine(points, self._nearest_beside(points, samples, reach))
 
     def _nearest_beside(self, points: Floats, samples: np.ndarray, reach: float) -> np.ndarray:
-        """Nearest samples of those that are up to 1.5 ``reach`` before and after these.
+        """Nearest samples of those that are up to :data:`_BESIDE` times ``reach`` before and after
+        these. Of two that are as near to within a sample, either may be taken.
 
         Inside a bend that is tighter than the track is wide, the walk stays behind at a local
         minimum: beside it lies the piece after the bend, where the car is.
         """
-        most = min(round(1.5 * reach / self._step), self._count // 2)
+        most = min(round(_BESIDE * reach / self._step), self._count // 2)
         around, found = np.arange(-most, most + 1), samples.copy()
         for i in range(0, len(points), _CHUNK):
             near = (samples[i : i + _CHUNK, None] + around) % self._count

@@ -167,7 +167,9 @@ class Track:
         """Foot points of a trajectory (m, 2), each sought from its predecessor's, the first from
         the guess or else everywhere.
 
-        A neighbouring piece of the track can't capture the trajectory. After a leap longer than
+        A neighbouring piece of the track can't capture the trajectory, unless it is the next one,
+        within 1.5 track widths along the centreline: a car inside a bend that is tighter than the
+        track is wide is beside the piece after the bend all of a sudden. After a leap longer than
         the track is wide, or farther than that from the piece, the search is global again.
         """
         points = np.asarray(xy, dtype=float).reshape(-1, 2)

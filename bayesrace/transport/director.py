@@ -162,8 +162,8 @@ class Director:
         In lockstep the plant ends the run itself when the controller disappears; in real time it
         brakes and goes on. A process, or the link to it, may be away for ``absence_s``.
         ``trouble``: a reason to stop waiting, such as a log that cannot be written; empty without.
-        ``paused``: called at each ``pause`` event, after which a run that waits goes on; its
-        duration does not count.
+        ``paused``: called at each ``pause`` event of a run in lockstep, which goes on after it; its
+        duration does not count, and signals wait for its end.
         Raises InputError for such a reason, after an absence or the timeout; KeyboardInterrupt on a
         signal.
         """
@@ -212,10 +212,11 @@ class Director:
             return 0.0
         begin_s = time.monotonic()
         paused(event)
-        if event.data.get("waits"):  # refused where the run has ended meanwhile
-            request = GoOnRequest(seq=0, source_time_ns=time.monotonic_ns())
-            ask(self._session, GO_ON, self._car, request)
-        return time.monotonic() - begin_s
+        request = GoOnRequest(seq=0, source_time_ns=time.monotonic_ns(), run=event.run)
+        reply = ask(self._session, GO_ON, self._car, request)
+        if not reply.accepted and self.status("plant").phase == "running":
+            raise InputError(f"run {event.run} does not go on: {reply.text}")
+        return time.monotonic() - begin_s  # refused, and over: its end follows
 
     def _hold(self) -> float:
         """Holds the run, if that is due; how long the loop that follows it may wait now [s]."""

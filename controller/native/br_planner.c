@@ -289,21 +289,23 @@ static double direction_at(const br_path *path, double s, double tangent[2]) {
     return (tangent[0] * ddy - tangent[1] * ddx) / (h * h);
 }
 
-/* Bounds hold at the stages alone. Between two of them a car inside a bend goes straight on where
- * the edge does not, by an eighth of its way times the angle by which the edge turns: so much
- * nearer is the edge. */
+/* Bounds hold at the stages alone. Between two of them the way is nearly straight, and the edge
+ * inside a bend comes nearer to it than at either, by an eighth of the way times the angle by which
+ * the edge turns. So the bound inside is that much nearer, by a quarter of the room at most. */
 static void stay_inside_between(const br_plan *plan, br_mpc_reference reference[BR_N]) {
     double nearer[BR_N];
     for (int k = 0; k < BR_N; ++k) {
         const br_mpc_reference *a = &reference[k > 0 ? k - 1 : k];
         const br_mpc_reference *b = &reference[k < BR_N - 1 ? k + 1 : k];
-        const double turn = (a->normal_x * b->normal_y - a->normal_y * b->normal_x) / (b - a);
+        const int stages = (int)(b - a);
+        const double turn = (a->normal_x * b->normal_y - a->normal_y * b->normal_x) / stages;
         const double way = hypot(plan->x[k + 1][BR_INDEX_X] - plan->x[k][BR_INDEX_X],
                                  plan->x[k + 1][BR_INDEX_Y] - plan->x[k][BR_INDEX_Y]);
         const double most = 0.25 * (reference[k].upper - reference[k].lower);
         nearer[k] = fmax(fmin(way * turn / 8, most), -most);
     }
-    for (int k = 0; k < BR_N; ++k) /* to the left, where the left edge is inside */
+    /* Above 0: a bend to the left, whose inside is the upper bound. */
+    for (int k = 0; k < BR_N; ++k)
         if (nearer[k] > 0)
             reference[k].upper -= nearer[k];
         else

@@ -156,16 +156,28 @@ def runs_of(log: LogColumns) -> dict[int, RunRecord]:
     found = {plan.run: plan for plan in plans}
     for run in np.unique(np.concatenate([log[topic]["run"] for topic in RUN_COLUMNS])).tolist():
         found.setdefault(run, PlannedRun(run, "", ""))
-    accepted = events["data"][events["kind"] == "weights_accepted"]
-    lost_s = {one.get("version"): one["unknown_s"] for one in accepted if "unknown_s" in one}
+    lost_s = _lost_s(events)
     return {
         run: RunRecord(
             plan,
             *(_of_run(log[topic], run) for topic in RUN_COLUMNS),
-            unknown_s=lost_s.get(plan.weights_version),
+            unknown_s=lost_s.get(run),
         )
         for run, plan in sorted(found.items())
     }
+
+
+def _lost_s(events: Columns) -> dict[int, float]:
+    """``unknown_s`` of the weights that were accepted right before a run, by its number."""
+    found, accepted = dict[int, float](), dict[str, Any]()
+    for kind, data in zip(events["kind"], events["data"], strict=True):
+        if kind == "weights_accepted":
+            accepted = data
+        elif kind == RUN_EVENT and (plan := PlannedRun.of_event(data)) is not None:
+            if "unknown_s" in accepted and accepted.get("version") == plan.weights_version:
+                found[plan.run] = float(accepted["unknown_s"])
+            accepted = {}
+    return found
 
 
 def _of_run(rows: Columns, run: int) -> Columns:
