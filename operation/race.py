@@ -297,13 +297,14 @@ class Drives:
                 # From the weights before the run on: what they miss shows a car that has changed.
                 so_far = [*self._learned_from, self.samples(plan)]
                 learned, _samples = updated_weights(so_far, self._settings, weights)
-                self._system.director.send_weights(learned.read_bytes())
-            except RefusedError as refusal:  # in the log, as the controller's event
-                _log.warning("%s", refusal)
             except (InputError, ArithmeticError, ValueError) as error:
                 _log.warning("nothing learned within the lap: %s", error)
-            else:
+                return
+            try:
+                self._system.director.send_weights(learned.read_bytes())
                 accepted = learned
+            except RefusedError as refusal:  # in the log, as the controller's event
+                _log.warning("%s", refusal)
 
         plan = replace(self._plan(controller), pause_s=self._settings.every or 0.0)
         self._system.drive(self._prepared.first.track, plan, self._recorder, update)

@@ -275,7 +275,9 @@ class PlantProcess:
             item = self.inbox.get(HEARTBEAT_S)
             if item is not None and item.kind is Kind.GONE and item.name == "controller":
                 end = End("controller_lost", "the controller vanished: killed or unreachable")
-            elif item is not None and item.kind is not Kind.MESSAGE:
+            elif item is not None and item.kind is Kind.MESSAGE:
+                self._overheard(item)
+            elif item is not None:
                 end = self._react(item)
             if end is None and time.monotonic() > deadline:
                 end = End("abandoned", f"nobody has told it to go on for {_PAUSE_S:g} s")

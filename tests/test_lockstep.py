@@ -115,9 +115,10 @@ def test_a_run_that_waits_for_its_director_goes_on_as_if_it_had_not(
     def paused(event: Event) -> None:
         now_s = float(event.data["time_s"])
         waited_s.append(now_s)
-        assert (
-            rig.director.status("plant").text == event.text == f"run {run} waits at {now_s:.2f} s"
-        )
+        another = ask(rig.session, GO_ON, "orca", blank(GoOnRequest, run=run + 1))
+        assert (another.accepted, another.text) == (False, f"none to go on: {event.text}")
+        assert event.text == f"run {run} waits at {now_s:.2f} s"
+        assert rig.director.status("plant").text.startswith(event.text)
         time.sleep(1.2 * (len(waited_s) == 2))
 
     for pause_s in (0.0, 0.5):

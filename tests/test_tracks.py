@@ -141,18 +141,23 @@ def test_path_projection_follows_a_weaving_car_for_laps(
     np.testing.assert_allclose(np.diff(path.progress_m), np.diff(s), atol=1e-6)
 
 
-def test_a_car_inside_a_bend_tighter_than_the_track_is_wide_is_on_it() -> None:
-    """Past the diagonal it is beside the piece after the bend, though still near that before."""
-    corners = [(0, 0, 0.1), (2, 0, 0.1), (2, 2, 0.1), (0, 2, 0.1)]
-    points = rounded_polygon(corners, 0.02, 0.02)
+@pytest.mark.parametrize("count", [3, 4, 6])
+def test_a_car_inside_a_bend_tighter_than_the_track_is_wide_is_on_it(count: int) -> None:
+    """Along the inner edge of a polygon: past the bisector of a corner it is beside the piece after
+    it, though still near that before."""
+    angle = 2 * np.pi * np.arange(count) / count
+    corners = 3 * np.column_stack([np.cos(angle), np.sin(angle)])
+    points = rounded_polygon([(x, y, 0.05) for x, y in corners], 0.02, 0.02)
     assert points is not None
-    track = Track.from_points("square", points, 0.25, 0.25)
-    side = np.column_stack([np.arange(0.24, 1.76, 0.02), np.full(76, 0.24)])
-    xy = np.concatenate([side, np.array([2, 0]) + side[:, ::-1] * [-1, 1]])
+    track = Track.from_points("polygon", points, 0.25, 0.25)
+    inner = corners * (1 - 0.24 / (3 * np.cos(np.pi / count)))
+    ways = zip(inner, np.roll(inner, -1, axis=0), strict=True)
+    xy = np.concatenate([np.linspace(a, b, 150, endpoint=False) for a, b in ways])
     path = track.project_path(xy)
     nearest = track.project_points(xy)
     np.testing.assert_allclose(path.off_track_m, nearest.off_track_m, atol=1e-9)
     assert (path.off_track_m < 0).all()
+    assert (np.diff(path.progress_m) > -1e-6).all()
 
 
 def test_path_projection_finds_the_way_back_after_a_gap() -> None:

@@ -27,7 +27,7 @@ __all__ = [
 ]
 
 _GAUSS_X, _GAUSS_W = np.polynomial.legendre.leggauss(5)
-_BESIDE = 1.5  # track widths: the way round a point on the edge is pi / 2 of half of one
+_BESIDE = 2.5  # track widths: how far apart the two feet are that a bend by 135 degrees may have
 _CHUNK = 256  # query points per distance matrix, bounds its memory
 _MAX_SAMPLES = 20_000
 _NODES_A_WIDTH: Final = 6

@@ -168,7 +168,7 @@ class Track:
         the guess or else everywhere.
 
         A neighbouring piece of the track can't capture the trajectory, unless it is the next one,
-        within 1.5 track widths along the centreline: a car inside a bend that is tighter than the
+        within 2.5 track widths along the centreline: a car inside a bend that is tighter than the
         track is wide is beside the piece after the bend all of a sudden. After a leap longer than
         the track is wide, or farther than that from the piece, the search is global again.
         """

@@ -35,7 +35,7 @@ class Rights(NamedTuple):
 RIGHTS: Final[dict[str, Rights]] = {
     "plant": Rights(
         "state truth event/plant status/plant", "actuation braking hold", "*/status",
-        "plant/run plant/stop plant/status", "alive/plant/*",
+        "plant/run plant/stop plant/go_on plant/status", "alive/plant/*",
     ),
     "controller": Rights(
         "actuation braking telemetry event/controller status/controller", "state hold", "",
@@ -48,7 +48,8 @@ RIGHTS: Final[dict[str, Rights]] = {
     ),
     "director": Rights(
         "event/race event/recorder hold", ALL_TOPICS,
-        "*/status plant/run plant/stop controller/weights controller/rollback controller/command",
+        "*/status plant/run plant/stop plant/go_on controller/weights controller/rollback "
+        "controller/command",
         "", "alive/director/*",
     ),
     "viewer": Rights("", ALL_TOPICS, "*/status"),
