@@ -264,7 +264,7 @@ def test_a_race_reports_its_training_drive(
     page = write_report(run).read_text()
     assert said in page
     section = page.split('<section id="training">')[1].split("</section>")[0]
-    assert section.count("<svg ") == 2  # the map, and what was covered
+    assert section.count("<svg ") == 3  # the map; what was covered, and where it was not
     for name in ("train.csv", "train_raceline.csv"):
         shutil.copyfile(run / name, run / name.replace("train", "practice"))
     shutil.copyfile(driven["calm"][1], run / "practice.mcap")
