@@ -275,7 +275,7 @@ def test_a_race_reports_its_training_drive(
     assert f"practice on paddock: laps {driven['calm'][0].laps_s[0]:.3f}" in text.getvalue()
     page = write_report(run).read_text()
     section = page.split('<section id="training">')[1].split("</section>")[0]
-    assert section.count("<svg ") == 3
+    assert section.count("<svg ") == 4
 
 
 @pytest.mark.check
