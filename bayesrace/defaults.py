@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Final
 
 __all__ = [
-    "CONFIGURATION_VARIABLE", "DEFAULT_CAR", "HEARTBEAT_VARIABLE", "MAX_POINTS",
+    "CONFIGURATION_VARIABLE", "DEFAULT_CAR", "HEARTBEAT_VARIABLE", "LEAST_LOSS_S", "MAX_POINTS",
     "MAX_WEIGHTS_BYTES", "Option",
 ]  # fmt: skip
 
@@ -27,6 +27,9 @@ MAX_POINTS: Final = 4096
 
 MAX_WEIGHTS_BYTES: Final = 1 << 20
 """Largest weights file, which is the largest message between processes."""
+
+LEAST_LOSS_S: Final = 0.01
+"""Least time a lap that is reported as lost where weights have learned too little."""
 
 
 @dataclass(frozen=True)

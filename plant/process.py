@@ -27,7 +27,7 @@ from bayesrace.messages import (
 )
 from bayesrace.plant.car import End
 from bayesrace.plant.process_settings import PlantSettings
-from bayesrace.plant.run import Run, RunCounters
+from bayesrace.plant.run import CONTROLLER_LOST, Run, RunCounters
 from bayesrace.plant.vehicle import Compile, FmuFault, Vehicle, open_vehicle
 from bayesrace.processes import die_with_parent
 from bayesrace.realtime import prepare_thread, suspension
@@ -83,7 +83,7 @@ class PlantProcess:
         self._run_number = 0
         self._runs = 0
         self._text = f"no run so far with {_played_by(settings, vehicle)}"
-        self._stopping = self._pauses = False
+        self._stopping = self._waits = False
         self._spare_s = 0.0
         """From when on links may be opened anew."""
         self._director_gone_ns: int | None = None
@@ -251,8 +251,8 @@ class PlantProcess:
             return None
         message, why_not = decode_request(request)
         if request.service is GO_ON:
-            waited = message is not None and self._pauses and message.run == self._run_number
-            self._pauses &= not waited
+            waited = message is not None and self._waits and message.run == self._run_number
+            self._waits &= not waited
             words = f"run {self._run_number} goes on" if waited else f"none to go on: {self._text}"
             request.reply(waited, why_not or words)
             return None
@@ -263,26 +263,25 @@ class PlantProcess:
         request.reply(True, f"run {self._run_number} stops")
         return End("stopped", f"stopped on request{of}: {message.text}")
 
-    def _pause(self) -> End | None:
+    def _pause(self, time_s: float) -> End | None:
         """Reports that the run waits, and waits until it may go on; returns what ends it."""
-        time_s = 0.0 if self._run is None else self._run.time_s
         running, self._text = self._text, f"run {self._run_number} waits at {time_s:.2f} s"
-        self._pauses = True
+        self._waits = True
         self._publish_event("pause", self._text, {"time_s": time_s})
         deadline = time.monotonic() + _PAUSE_S
         end: End | None = None
-        while self._pauses and end is None:
+        while self._waits and end is None:
             item = self.inbox.get(HEARTBEAT_S)
             if item is not None and item.kind is Kind.GONE and item.name == "controller":
-                end = End("controller_lost", "the controller vanished: killed or unreachable")
+                end = CONTROLLER_LOST
             elif item is not None and item.kind is Kind.MESSAGE:
                 self._overheard(item)
             elif item is not None:
                 end = self._react(item)
             if end is None and time.monotonic() > deadline:
-                end = End("abandoned", f"nobody has told it to go on for {_PAUSE_S:g} s")
+                end = End("abandoned", f"the run waited {_PAUSE_S:g} s in a pause: no go_on came")
             end = end or self._beat()
-        self._pauses, self._text = False, running
+        self._waits, self._text = False, running
         return end
 
     def _publish_event(self, kind: str, text: str, data: Mapping[str, Scalar]) -> None:

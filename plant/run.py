@@ -16,7 +16,9 @@ from bayesrace.sensors import EXACT, Sensors
 from bayesrace.transport import LOCKSTEP_SPIN_S, Inbox, Item, Kind, Numbering, Publisher
 from bayesrace.transport.hold import HOLD_MISSING, HoldWatch
 
-__all__ = ["Run", "RunCounters"]
+__all__ = ["CONTROLLER_LOST", "Run", "RunCounters"]
+
+CONTROLLER_LOST: Final = End("controller_lost", "the controller vanished: killed or unreachable")
 
 _REMEMBERED: Final = 1024
 """States to which an actuation may refer; one for an older state is stale."""
@@ -83,9 +85,9 @@ class Run:
     returns, if anything, ends the run."""
     beat: Callable[[], End | None]
     """Called once a period; what it returns ends the run, too."""
-    pause: Callable[[], End | None]
-    """Called in lockstep after each :attr:`.RunRequest.pause_s`; returns when the run may go on, or
-    what ends it."""
+    pause: Callable[[float], End | None]
+    """Called in lockstep after each :attr:`.RunRequest.pause_s`, with plant time; returns when the
+    run may go on, or what ends it."""
     suspended: Callable[[float], None]
     """Called when the process has not run for so many seconds in real time."""
     hold: HoldWatch
@@ -149,7 +151,7 @@ class Run:
         end, pause_s = self.beat(), self.request.pause_s
         if end is None and 0 < pause_s * (self._pauses + 1) <= self.time_s + _ROUNDING_S:
             self._pauses += 1
-            end = self.pause()
+            end = self.pause(self.time_s)
         return end
 
     def _exchange(self, state: State, x: tuple[float, ...]) -> tuple[float, ...] | End:
@@ -175,7 +177,7 @@ class Run:
                     return actuation.u
                 self.counters.stale += 1
             elif item.kind is Kind.GONE and item.name == "controller":
-                return End("controller_lost", "the controller vanished: killed or unreachable")
+                return CONTROLLER_LOST
             elif (end := self.react(item)) is not None:
                 return end
 

@@ -118,7 +118,7 @@ def run_of(
         request=wanted, simulator=car, inbox=cast(Inbox, controller),
         states=cast(Publisher[State], controller), truths=cast(Publisher[Truth], controller),
         decoder=Decoder(Actuation), counters=RunCounters(), numbering=Numbering(),
-        react=lambda _: None, beat=beat, pause=lambda: None, suspended=lambda _: None,
+        react=lambda _: None, beat=beat, pause=lambda _: None, suspended=lambda _: None,
         hold=cast(HoldWatch, hold), epoch=7,
     )  # fmt: skip
     return controller, run.execute()

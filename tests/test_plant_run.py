@@ -136,7 +136,7 @@ def run_with(
         states=cast(Publisher[State], controller),
         truths=cast(Publisher[Truth], controller), decoder=Decoder(Actuation), counters=counters,
         numbering=Numbering(), react=controller.react, beat=lambda: None, epoch=EPOCH,
-        pause=lambda: None, suspended=suspensions.append, delay_s=delay_s,
+        pause=lambda _: None, suspended=suspensions.append, delay_s=delay_s,
         hold=cast(HoldWatch, hold),
     )  # fmt: skip
     end = run.execute()

@@ -27,7 +27,8 @@ __all__ = [
 ]
 
 _GAUSS_X, _GAUSS_W = np.polynomial.legendre.leggauss(5)
-_BESIDE = 2.5  # track widths: how far apart the two feet are that a bend by 135 degrees may have
+_BESIDE = 2.5  # track widths between the two feet of a car inside a bend, up to 135 degrees
+_ONE_FOOT = 0.8  # of the least radius: nearer to the curve, a bend has one foot
 _CHUNK = 256  # query points per distance matrix, bounds its memory
 _MAX_SAMPLES = 20_000
 _NODES_A_WIDTH: Final = 6
@@ -171,6 +172,14 @@ class CentrelineSearch:
         """The samples as plain floats: the walk below visits few of them, one by one."""
         return self._samples[:, 0].tolist(), self._samples[:, 1].tolist()
 
+    @cached_property
+    def _least_radius_m(self) -> float:
+        s: Floats = np.arange(self._count, dtype=np.float64) * self._step
+        _, first, second = self._curve.derivatives(s)
+        cross = first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]
+        curvature = np.abs(cross) / np.linalg.norm(first, axis=1) ** 3
+        return float(1 / np.max(curvature, initial=1e-9))
+
     def nearest(self, points: Floats) -> Floats:
         """Arc lengths (m,) in [0, period) of the globally nearest curve points to (m, 2)."""
         parts = [self._nearest_chunk(points[i : i + _CHUNK]) for i in range(0, len(points), _CHUNK)]
@@ -220,11 +229,12 @@ class CentrelineSearch:
         """
         most = min(round(_BESIDE * reach / self._step), self._count // 2)
         around, found = np.arange(-most, most + 1), samples.copy()
-        for i in range(0, len(points), _CHUNK):
-            near = (samples[i : i + _CHUNK, None] + around) % self._count
-            away = points[i : i + _CHUNK, None] - self._samples[near]
-            lowest = np.argmin(np.sum(away**2, axis=2), axis=1)
-            found[i : i + _CHUNK] = near[np.arange(len(near)), lowest]
+        away_m = np.linalg.norm(points - self._samples[samples], axis=1)
+        sought = np.flatnonzero(away_m > _ONE_FOOT * self._least_radius_m)
+        for part in (sought[i : i + _CHUNK] for i in range(0, len(sought), _CHUNK)):
+            near = (samples[part, None] + around) % self._count
+            square = np.sum((points[part, None] - self._samples[near]) ** 2, axis=2)
+            found[part] = near[np.arange(len(part)), np.argmin(square, axis=1)]
         return found
 
     def _walk(self, x: float, y: float, at: int) -> int:

@@ -17,6 +17,7 @@ from bayesrace.controller.settings import GateSettings
 from bayesrace.controller.weights.adoption import Adoption, Ruling, Task, WeightsPort
 from bayesrace.controller.weights.checks import Samples, judged
 from bayesrace.controller.weights.store import AcceptedWeights, digest_of
+from bayesrace.defaults import LEAST_LOSS_S
 from bayesrace.errors import InputError
 from bayesrace.messages import ROLLBACK, WEIGHTS, Scalar
 from bayesrace.transport import Request, declare_service, decode_request
@@ -34,9 +35,6 @@ _END_S: Final = 5.0
 """For the request at hand when the controller ends."""
 _POLL_S: Final = 0.02
 """Between two looks at what is waited for: the control thread wakes no other thread."""
-
-_NOTED_S: Final = 0.01
-"""Of a lap: less is not worth a word."""
 
 _MOST_WAITING: Final = 32
 """Requests; each may hold a file."""
@@ -167,7 +165,7 @@ class WeightUpdateManager:
         in_use = f"in use from cycle {cycle} on, as number {new.number}"
         text = f"weights {new.version} {in_use}; {verdict['text']}"
         unknown_s = self._port.step.unknown_s
-        if unknown_s >= _NOTED_S:
+        if unknown_s >= LEAST_LOSS_S:
             where = "where the line is faster than what they have learned"
             text += f"; {unknown_s:.2f} s a lap are lost {where}: train on a track with such bends"
         facts = {

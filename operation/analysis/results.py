@@ -6,6 +6,7 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from bayesrace.defaults import LEAST_LOSS_S
 from bayesrace.errors import InputError, faults_in
 from bayesrace.files import read_whole, write_whole
 
@@ -100,6 +101,11 @@ class LapResult(_Frozen):
         description="what a lap loses where the racing line is faster than what the run's first "
         "weights have learned; null where the controller has not said so",
     )
+
+    @property
+    def lost_s(self) -> float | None:
+        """:attr:`unknown_s`, if it is large enough to report."""
+        return self.unknown_s if (self.unknown_s or 0) >= LEAST_LOSS_S else None
 
     @property
     def fallbacks(self) -> int:

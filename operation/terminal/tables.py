@@ -34,9 +34,6 @@ __all__ = [
     "print_validation",
 ]
 
-_NOTED_S = 0.01
-"""Of a lap: what is lost is said from here on."""
-
 
 class Column(NamedTuple):
     """One column of the result table, on the terminal and in the report."""
@@ -185,8 +182,8 @@ def print_table(result: RaceResult, console: Console) -> None:
 def _facts(lap: LapResult) -> list[str]:
     """What drove, each lap over the limit, and where the car was between the samples."""
     facts = [f"weights {lap.weights_version}"] if lap.weights_version else []
-    if lap.unknown_s and lap.unknown_s >= _NOTED_S:
-        facts.append(f"{lap.unknown_s:.2f} s a lap lost where they know too little")
+    if lap.lost_s is not None:
+        facts.append(f"{lap.lost_s:.2f} s a lap lost where they know too little")
     if lap.limit_ratios:
         ratios = " ".join(f"{ratio:.3f}" for ratio in lap.limit_ratios)
         facts.append(f"laps over the limit {ratios}")
