@@ -200,9 +200,12 @@ def test_an_overtaken_answer_is_reported_and_does_not_act() -> None:
     assert states[-1].x[3] > 1.0
 
 
-@pytest.mark.parametrize(("run", "planned"), [(1, 6), (2, 0)])
-def test_a_plan_is_carried_out_when_answers_are_overdue(run: int, planned: int) -> None:
-    """With its steering, until answers take over again; none of another run."""
+@pytest.mark.parametrize(("run", "is_planned"), [(1, True), (2, False)])
+def test_a_plan_is_carried_out_when_answers_are_overdue(run: int, is_planned: bool) -> None:
+    """With its steering, until answers take over again; none of another run.
+
+    Six substeps are overdue, and more on a machine that stalls: the end says that it ends.
+    """
 
     def answer(state: State) -> list[dict[str, Any]]:
         if 3 <= state.seq < 10:
@@ -214,9 +217,9 @@ def test_a_plan_is_carried_out_when_answers_are_overdue(run: int, planned: int) 
         return [{"plan": plan}]
 
     states, _, guarded = execute(answer)
-    assert guarded.planned == pytest.approx(planned, abs=3 if planned else 0)
-    if planned:
-        assert max(state.x[6] for state in states[:11]) == pytest.approx(0.07, abs=0.025)
+    assert guarded.planned > 2 if is_planned else guarded.planned == 0
+    if is_planned:
+        assert max(state.x[6] for state in states[:11]) > 0.045  # the plan's own: 0.01 a period
         assert states[9].u_applied[0] < 0
     assert states[-1].u_applied[0] > 0.9
 
