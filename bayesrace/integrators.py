@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from bayesrace.vehicles.parameters import CarParameters
+from bayesrace.vehicles.parameters import Car
 
 if TYPE_CHECKING:
     import casadi as ca
@@ -169,7 +169,7 @@ class Discretisation(BaseModel):
                 x_next[:3] = pose_from_velocities(x, x_next[3:6], step_s)
         return x_next
 
-    def identity(self, model_name: str, car: CarParameters) -> str:
+    def identity(self, model_name: str, car: Car) -> str:
         """Text that two discretised models share if and only if they are the same map."""
         scheme = f"{self.scheme}x{self.substeps}-{self.pose}"
         return f"{model_name}/{scheme}/{self.step_s:.9g}s/{car.name}-{car.digest()}"

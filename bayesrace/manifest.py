@@ -19,7 +19,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from bayesrace.errors import InputError, faults_in
 from bayesrace.files import read_whole
 from bayesrace.trusted_files import trusted
-from bayesrace.vehicles.parameters import CarParameters
+from bayesrace.vehicles.parameters import Car
 
 __all__ = [
     "DECLARATIONS",
@@ -93,7 +93,7 @@ class Manifest(BaseModel):
     library_sha256: str
     interface_sha256: str
 
-    def check_car(self, car: CarParameters, artefact: Path) -> None:
+    def check_car(self, car: Car, artefact: Path) -> None:
         """InputError if this artefact was built for another car, or solves another problem."""
         if self.problem.name not in DRIVING_PROBLEMS:
             raise InputError(

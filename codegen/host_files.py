@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from bayesrace.errors import InputError
 from bayesrace.files import write_whole
-from bayesrace.gp.weights import GpWeights, pack_weights, zero_weights
+from bayesrace.gp.weights import Weights, pack_weights, zero_weights
 from bayesrace.manifest import Manifest
 
 __all__ = [
@@ -67,7 +67,7 @@ def path_file(rows: ArrayLike, spacing_m: float) -> bytes:
     return _file(b"BRFMPATH", struct.pack("<d", spacing_m) + table.tobytes())
 
 
-def weights_file(weights: GpWeights | None, identity: str, capacity: int) -> bytes:
+def weights_file(weights: Weights | None, identity: str, capacity: int) -> bytes:
     """The file of the residual's weights; None: no correction.
 
     ``identity``: of the discretised model that the controller predicts with, ``capacity``: training
@@ -96,7 +96,7 @@ def export(
     rows: ArrayLike,
     spacing_m: float,
     values: Mapping[str, float | tuple[float, ...]],
-    weights: GpWeights | None,
+    weights: Weights | None,
 ) -> None:
     """Writes all three files for a built controller; arguments as of the functions above."""
     folder.mkdir(parents=True, exist_ok=True)

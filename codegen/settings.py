@@ -6,7 +6,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from bayesrace.defaults import MAX_POINTS
 from bayesrace.integrators import PERFECT, PREDICTION, Discretisation
-from bayesrace.vehicles import DEFAULT_CAR, CarParameters, CarSetting, default_car, get_car
+from bayesrace.vehicles import DEFAULT_CAR, Car, CarSetting, default_car, get_car
 
 __all__ = ["BuildSettings", "ProblemName"]
 
@@ -68,7 +68,7 @@ class BuildSettings(BaseModel):
     @classmethod
     def best_case(
         cls,
-        car: str | CarParameters = DEFAULT_CAR,
+        car: str | Car = DEFAULT_CAR,
         horizon: int | None = None,
         problem: ProblemName = "tracking",
     ) -> "BuildSettings":

@@ -19,7 +19,7 @@ from bayesrace.controller.weights.store import AcceptedWeights, History, Store, 
 from bayesrace.errors import InputError, faults_in
 from bayesrace.files import read_whole
 from bayesrace.gp.weights import (
-    GpWeights,
+    Weights,
     decode_weights,
     encode_weights,
     pack_weights,
@@ -29,7 +29,7 @@ from bayesrace.messages import NOT_REPORTED
 from bayesrace.raceline import RaceLine, read_raceline_for
 from bayesrace.tracks import Track, load_track
 from bayesrace.tracks.spline import PlaneSpline
-from bayesrace.vehicles import CarParameters
+from bayesrace.vehicles import Car
 
 __all__ = [
     "CAPACITY", "PathTable", "PredictiveController", "compiled_controller", "make_path_table",
@@ -170,10 +170,10 @@ def read_settings(path: Path | None, form: type[Settings]) -> Settings:
 
 def compiled_controller(
     artefact: Path,
-    car: CarParameters,
+    car: Car,
     track: Track,
     line: RaceLine,
-    weights: GpWeights | Path | None = None,
+    weights: Weights | Path | None = None,
     settings: MpcSettings | None = None,
     *,
     table: PathTable | None = None,
@@ -192,9 +192,7 @@ def compiled_controller(
     return PredictiveController(step, track=track.identity)
 
 
-def read_checked(
-    path: Path, artefact: Path, car: CarParameters, gate: GateSettings | None = None
-) -> GpWeights:
+def read_checked(path: Path, artefact: Path, car: Car, gate: GateSettings | None = None) -> Weights:
     """Weights that may drive the car from the start, with the controller of ``artefact``; nothing
     watches them there. InputError names the file and what it fails."""
     weights = read_weights(path)
@@ -207,7 +205,7 @@ def read_checked(
 
 def predictive_controller(
     artefact: Path,
-    car: CarParameters,
+    car: Car,
     track: str | Path,
     raceline: Path,
     settings: Path | None = None,

@@ -18,7 +18,7 @@ from bayesrace.controller.driver import Decision, Driver
 from bayesrace.controller.interface import NO_PLAN, Controller, Environment, StepOutput
 from bayesrace.controller.process_settings import ControllerSettings
 from bayesrace.messages import NOT_REPORTED, SENSOR_FAULTS, Actuation, State, Telemetry
-from bayesrace.vehicles.parameters import CarParameters
+from bayesrace.vehicles.parameters import Car
 
 __all__ = ["Cycle", "Timing"]
 
@@ -61,9 +61,7 @@ class Timing:
 class Cycle:
     """Drives one car with one controller; for one thread."""
 
-    def __init__(
-        self, controller: Controller, car: CarParameters, settings: ControllerSettings
-    ) -> None:
+    def __init__(self, controller: Controller, car: Car, settings: ControllerSettings) -> None:
         """``car``: whose limits hold."""
         self.driver = Driver(controller, car, settings)
         self.timing = Timing()

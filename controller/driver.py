@@ -24,7 +24,7 @@ from bayesrace.messages import (
     State,
 )
 from bayesrace.transport import Numbering
-from bayesrace.vehicles.parameters import CarParameters
+from bayesrace.vehicles.parameters import Car
 
 __all__ = [
     "DOUBTED",
@@ -90,9 +90,7 @@ class Decision:
 class Driver:
     """Drives one car with one controller; for one thread."""
 
-    def __init__(
-        self, controller: Controller, car: CarParameters, settings: ControllerSettings
-    ) -> None:
+    def __init__(self, controller: Controller, car: Car, settings: ControllerSettings) -> None:
         """``car``: whose limits hold. InputError if the controller's artefact drives no car."""
         self.controller = controller
         artefact = controller.artefact

@@ -18,10 +18,10 @@ from bayesrace.arrays import Floats
 from bayesrace.controller.interface import Environment
 from bayesrace.controller.settings import MpcSettings
 from bayesrace.errors import InputError
-from bayesrace.gp.weights import OUTPUT_HEAD, GpWeights, pack_weights
+from bayesrace.gp.weights import OUTPUT_HEAD, Weights, pack_weights
 from bayesrace.manifest import DECLARATIONS, LIBRARY, opened_library, read_manifest
 from bayesrace.trusted_files import loadable
-from bayesrace.vehicles import CarParameters
+from bayesrace.vehicles import Car
 
 if TYPE_CHECKING:
     from bayesrace.controller.assembly import PathTable
@@ -435,14 +435,14 @@ class NativeProblem:
 class NativeStep(NativeProblem):
     """The control step of a car that follows a racing line."""
 
-    def __init__(self, artefact: Path, car: CarParameters, settings: MpcSettings) -> None:
+    def __init__(self, artefact: Path, car: Car, settings: MpcSettings) -> None:
         """InputError if it was built for another car."""
         super().__init__(artefact)
         self.manifest.check_car(car, artefact)
         self._line_mps, self._spacing_m = np.zeros(0), 0.0
         self.set_parameters(car, settings)
 
-    def set_parameters(self, car: CarParameters, settings: MpcSettings) -> None:
+    def set_parameters(self, car: Car, settings: MpcSettings) -> None:
         """Weights, limits and tolerances of the OCP; effective from the next step."""
         self.set_values(settings.parameters(car, self.manifest.problem.name))
 
@@ -466,7 +466,7 @@ class NativeStep(NativeProblem):
         """What a lap loses to the line because the weights in use do not know the car there."""
         return self._spacing_m * float((1 / self.speeds() - 1 / self._line_mps).sum())
 
-    def set_weights(self, weights: GpWeights) -> None:
+    def set_weights(self, weights: Weights) -> None:
         """Uses the weights from the next step on; InputError if they are for another model."""
         weights.check_fit(self.manifest.discretisation, self.manifest.gp_capacity)
         self.load_weights(pack_weights(weights), weights.version)

@@ -13,7 +13,7 @@ from bayesrace.controller.settings import (
 from bayesrace.defaults import Option
 from bayesrace.realtime import RealtimeSettings
 from bayesrace.transport import CONTROLLER_ENDPOINT, PLANT_ENDPOINT, Endpoints
-from bayesrace.vehicles import CarParameters, CarSetting, default_car
+from bayesrace.vehicles import Car, CarSetting, default_car
 
 __all__ = ["ControllerSettings"]
 
@@ -52,7 +52,7 @@ class ControllerSettings(BaseModel):
     realtime: RealtimeSettings = RealtimeSettings()
     parent_pid: int | None = Field(None, description="end when this process, the parent, ends")
 
-    def cycle_values(self, car: CarParameters) -> dict[str, float]:
+    def cycle_values(self, car: Car) -> dict[str, float]:
         """The numbers of br_driving (controller/native/bayesrace_cycle.h) by name, but limits."""
         return {
             **car.brake_numbers,

@@ -16,7 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from bayesrace.arrays import Floats
 from bayesrace.controller.interface import NO_LIMITS, Environment, StepOutput
 from bayesrace.errors import InputError
-from bayesrace.vehicles.parameters import CarParameters
+from bayesrace.vehicles.parameters import Car
 
 __all__ = ["DrivingStyle", "PurePursuit", "PurePursuitSettings"]
 
@@ -85,7 +85,7 @@ class PurePursuit:
 
     def __init__(
         self,
-        car: CarParameters,
+        car: Car,
         x_m: Floats,
         y_m: Floats,
         vx_mps: Floats,

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Final, Literal
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from bayesrace.defaults import Option
-from bayesrace.vehicles import CarParameters
+from bayesrace.vehicles import Car
 
 __all__ = [
     "SAMPLES", "WATCHED", "CompensationMode", "CompensationSettings", "FallbackSettings",
@@ -88,7 +88,7 @@ class MpcSettings(BaseModel):
         """Standard deviations of a normal distribution that :attr:`caution` amounts to."""
         return NormalDist().inv_cdf(self.caution) if self.caution else 0.0
 
-    def parameters(self, car: CarParameters, problem: str = "tracking") -> dict[str, float]:
+    def parameters(self, car: Car, problem: str = "tracking") -> dict[str, float]:
         """Run-time parameters of the problem and settings of its solver, by name."""
         tuning = car.tuning.objective.model_dump(exclude={"horizon"})
         if problem == "progress":

@@ -18,7 +18,7 @@ from typing import Final
 import numpy as np
 
 from bayesrace.arrays import Floats
-from bayesrace.gp.weights import GpWeights
+from bayesrace.gp.weights import Weights
 from bayesrace.integrators import Discretisation
 from bayesrace.learning.dataset import Dataset, concatenate
 from bayesrace.learning.drives import Estimates
@@ -43,7 +43,7 @@ _LEARNED: Final = 400
 """New samples that the difference is learned from at most."""
 
 
-def _changed_at(dataset: Dataset, weights: GpWeights, discretisation: Discretisation) -> int | None:
+def _changed_at(dataset: Dataset, weights: Weights, discretisation: Discretisation) -> int | None:
     """Number of the first sample of the car as it is now; None: it is the car of the weights.
 
     ``dataset``: in the order in which it was driven. What errors exceed the usual by is added up
@@ -60,7 +60,7 @@ def _changed_at(dataset: Dataset, weights: GpWeights, discretisation: Discretisa
 
 
 def brought_up_to_date(
-    dataset: Dataset, weights: GpWeights, discretisation: Discretisation
+    dataset: Dataset, weights: Weights, discretisation: Discretisation
 ) -> tuple[Dataset, int]:
     """The samples, in the order in which they were driven, as the car would do them now; and how
     many of them have been moved, from the first one on.
@@ -89,7 +89,7 @@ def said(moved: int, count: int) -> str:
 
 
 def _change(
-    before: Dataset, after: Dataset, weights: GpWeights, discretisation: Discretisation
+    before: Dataset, after: Dataset, weights: Weights, discretisation: Discretisation
 ) -> tuple[Floats, Floats]:
     """What is to be added to the residuals of samples from before, and its standard deviations,
     both (n, 3)."""

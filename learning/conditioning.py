@@ -34,7 +34,7 @@ from scipy.optimize import brentq
 
 from bayesrace.arrays import Floats, Rows
 from bayesrace.gp.expression import kernel_matrix
-from bayesrace.gp.weights import FEATURES, GpOutput, GpWeights
+from bayesrace.gp.weights import FEATURES, GpOutput, Weights
 from bayesrace.integrators import Discretisation
 from bayesrace.learning.dataset import MIRRORED_FEATURES, MIRRORED_OUTPUTS, Dataset
 from bayesrace.learning.drives import Drive, Estimates, Event, Measured
@@ -49,7 +49,7 @@ from bayesrace.learning.smoothing import (
 )
 from bayesrace.learning.subset import evenly, most_informative
 from bayesrace.learning.validation import residual
-from bayesrace.vehicles.parameters import CarParameters
+from bayesrace.vehicles.parameters import Car
 
 __all__ = ["conditioned"]
 
@@ -70,12 +70,12 @@ _LATER: Final = 48
 
 
 def conditioned(
-    weights: GpWeights,
+    weights: Weights,
     dataset: Dataset,
     discretisation: Discretisation,
     capacity: int,
     noise_share: float,
-) -> GpWeights:
+) -> Weights:
     """The same kernels, with the mean and the variance that the readings of the drives leave, and
     the samples without drives.
 
@@ -252,9 +252,9 @@ class _Belief:
         self,
         drive: Drive,
         samples: Rows,
-        car: CarParameters,
+        car: Car,
         discretisation: Discretisation,
-        weights: GpWeights,
+        weights: Weights,
     ) -> None:
         """Takes in all readings of a smoothed drive, linearised along its path and ``weights``.
 
@@ -280,9 +280,9 @@ class _Belief:
         events: Sequence[Event],
         path: Floats,
         samples: Rows,
-        car: CarParameters,
+        car: Car,
         discretisation: Discretisation,
-        weights: GpWeights,
+        weights: Weights,
     ) -> "_Chain":
         columns, rows = inputs_of(events[1:]), period_begins(events)
         u, h, begin = columns[0].T, columns[1][0], path[rows, :_NX]

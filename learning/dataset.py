@@ -14,7 +14,7 @@ from bayesrace.arrays import Flags, Floats
 from bayesrace.columns import Columns
 from bayesrace.errors import InputError
 from bayesrace.learning.drives import Estimates
-from bayesrace.vehicles.parameters import CarParameters
+from bayesrace.vehicles.parameters import Car
 
 __all__ = ["MIRRORED_FEATURES", "MIRRORED_OUTPUTS", "ROUNDING", "SIGMAS", "Dataset", "concatenate"]
 __all__ += ["consecutive", "dataset_from_arrays", "filter_dataset", "left_out"]
@@ -45,7 +45,7 @@ class Dataset:
     that are not finite.
     """
 
-    car: CarParameters
+    car: Car
     step_s: float
     x: Floats
     u: Floats
@@ -146,9 +146,7 @@ def left_out(dropped: Mapping[str, int]) -> str:
     return ", ".join(f"{count} {reason}" for reason, count in dropped.items()) or "none"
 
 
-def dataset_from_arrays(
-    car: CarParameters, step_s: float, states: ArrayLike, inputs: ArrayLike
-) -> Dataset:
+def dataset_from_arrays(car: Car, step_s: float, states: ArrayLike, inputs: ArrayLike) -> Dataset:
     """Samples of one unbroken drive: ``states`` (n + 1, 7), ``inputs`` (n, 2)."""
     x, u = np.asarray(states, dtype=np.float64), np.asarray(inputs, dtype=np.float64)
     if x.ndim != 2 or u.ndim != 2 or len(x) != len(u) + 1:

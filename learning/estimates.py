@@ -11,13 +11,13 @@ import numpy as np
 from bayesrace.arrays import Floats, Rows
 from bayesrace.columns import Columns
 from bayesrace.errors import InputError
-from bayesrace.gp.weights import GpWeights
+from bayesrace.gp.weights import Weights
 from bayesrace.integrators import PREDICTION, Discretisation
 from bayesrace.learning.conditioning import conditioned
 from bayesrace.learning.dataset import ROUNDING, Dataset, consecutive
 from bayesrace.learning.drives import Drive, Estimates
 from bayesrace.learning.smoothing import Smoothed, corrected_steps, smooth
-from bayesrace.vehicles.parameters import CarParameters
+from bayesrace.vehicles.parameters import Car
 
 __all__ = ["learned_in_turns", "smoothed_again", "smoothed_states"]
 
@@ -39,14 +39,14 @@ smoothing left unknown, which the next one would only confirm."""
 
 class _Learned(Protocol):
     @property
-    def weights(self) -> GpWeights: ...
+    def weights(self) -> Weights: ...
 
 
 L = TypeVar("L", bound=_Learned)
 
 
 def smoothed_states(
-    states: Columns, cycles: Columns, car: CarParameters, step_s: float
+    states: Columns, cycles: Columns, car: Car, step_s: float
 ) -> tuple[Columns, Estimates, Counter[str]]:
     """``states`` with ``x`` smoothed by the random walk where they are estimated; how well they are
     known, row by row; and how many are of parts that nothing can be made of, by reason.
@@ -77,7 +77,7 @@ def smoothed_states(
     return filled[kept], Estimates(deviation, origin, tuple(drives)).select(kept), lost
 
 
-def smoothed_again(dataset: Dataset, discretisation: Discretisation, weights: GpWeights) -> Dataset:
+def smoothed_again(dataset: Dataset, discretisation: Discretisation, weights: Weights) -> Dataset:
     """The same samples, those whose drives are at hand smoothed by the corrected model. Those of a
     drive that it cannot follow stay as they are, without their drive."""
     estimates = dataset.estimates
@@ -104,10 +104,10 @@ def smoothed_again(dataset: Dataset, discretisation: Discretisation, weights: Gp
 def learned_in_turns(
     dataset: Dataset,
     discretisation: Discretisation,
-    weights: GpWeights | None,
-    learn: Callable[[Dataset, GpWeights | None], L],
+    weights: Weights | None,
+    learn: Callable[[Dataset, Weights | None], L],
     capacity: int,
-) -> tuple[Dataset, L, GpWeights]:
+) -> tuple[Dataset, L, Weights]:
     """The samples smoothed, what ``learn`` has made of them, and its weights conditioned on the
     readings, each by the weights before: ``weights``, or such of the samples as they are given.
 
@@ -125,7 +125,7 @@ def learned_in_turns(
     return dataset, made, before
 
 
-def _surer(weights: GpWeights) -> GpWeights:
+def _surer(weights: Weights) -> Weights:
     a, b, c = (replace(one, noise_variance=_NOISE * one.noise_variance) for one in weights.outputs)
     return replace(weights, outputs=(a, b, c))
 
@@ -159,9 +159,9 @@ def _drive(states: Columns, cycles: Columns, step_s: float) -> Drive | None:
 def _deviation(
     found: Smoothed,
     drive: Drive,
-    car: CarParameters,
+    car: Car,
     discretisation: Discretisation,
-    weights: GpWeights | None,
+    weights: Weights | None,
 ) -> Floats:
     """Standard deviations (m, 4) of the steps from the smoothed states on, and of the angles; of
     the last state's step there is none."""

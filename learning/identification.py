@@ -24,7 +24,7 @@ from bayesrace.learning.single_track import TYRES, Cars, Numbers
 from bayesrace.learning.window_fit import Fit, polynomials, states_of
 from bayesrace.messages import QUANTITIES
 from bayesrace.sensors import FIELDS, Sensors
-from bayesrace.vehicles import CarParameters
+from bayesrace.vehicles import Car
 from bayesrace.vehicles.parts import GRAVITY_MPS2, DcMotor, Pacejka
 
 __all__ = ["Comparison", "Identified", "Value", "identify"]
@@ -77,7 +77,7 @@ class Comparison:
 class Identified:
     """The car with the numbers that were found, and what stands behind them."""
 
-    car: CarParameters
+    car: Car
     values: tuple[Value, ...]
     unknown: tuple[str, ...]
     """What the drive does not show, each with the remedy."""
@@ -107,7 +107,7 @@ class Identified:
 
 
 def identify(
-    car: CarParameters,
+    car: Car,
     drives: Drives,
     *,
     wheelbase: bool = False,
@@ -138,7 +138,7 @@ def identify(
 class _Report:
     """From the fit to the numbers of a car's file."""
 
-    def __init__(self, car: CarParameters, fit: Fit) -> None:
+    def __init__(self, car: Car, fit: Fit) -> None:
         self._car, self._fit, self._instruments = car, fit, fit.drives.instruments
         self._covariance = fit.covariance()
         pairs = zip(fit.theta, np.sqrt(np.diag(self._covariance)), strict=True)
@@ -165,7 +165,7 @@ class _Report:
         if tyres:
             changes |= self._tyres()
         return Identified(
-            car=CarParameters.model_validate(car.model_dump(exclude_unset=True) | changes),
+            car=Car.model_validate(car.model_dump(exclude_unset=True) | changes),
             values=(*values, *measured),
             unknown=tuple(unknown),
             used_s=fit.used_s,
@@ -337,7 +337,7 @@ def _unsure(drag: Value) -> str:
     )
 
 
-def _skid_pad(car: CarParameters, numbers: Floats) -> Floats:
+def _skid_pad(car: Car, numbers: Floats) -> Floats:
     """Largest lateral acceleration over g of cars (p, n) on rising throttle, their steering
     held."""
     delta, length_m = _HELD * car.delta_max_rad, car.wheelbase_m

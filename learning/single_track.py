@@ -15,7 +15,7 @@ from scipy.signal import lfilter
 from bayesrace.arrays import AnyArray, Floats, Rows
 from bayesrace.learning.instruments import Drives, Windows
 from bayesrace.messages import QUANTITIES
-from bayesrace.vehicles import CarParameters
+from bayesrace.vehicles import Car
 from bayesrace.vehicles.models import dynamic_with_parameters
 from bayesrace.vehicles.parts import GRAVITY_MPS2, DcMotor, LinearTyres, Pacejka, PacejkaTyres
 
@@ -74,8 +74,8 @@ class Numbers(NamedTuple):
     delay_s: Any = 0.0
     """From a command to what the first instrument says of it."""
 
-    def equation_numbers(self, like: CarParameters) -> dict[str, Any]:
-        """By name, as :attr:`CarParameters.equation_numbers`, with the mass of another car."""
+    def equation_numbers(self, like: Car) -> dict[str, Any]:
+        """By name, as :attr:`Car.equation_numbers`, with the mass of another car."""
         mass, length = like.mass_kg, self.size * like.wheelbase_m
         lf, lr = self.size * like.lf_m, self.size * like.lr_m
         found = {
@@ -95,7 +95,7 @@ class Numbers(NamedTuple):
 
 
 @lru_cache
-def _step(like: CarParameters) -> ca.Function:
+def _step(like: Car) -> ca.Function:
     """One step of RK4 of cars with such tyres: (x (6,), [h, d, angles at its beginning, middle and
     end], numbers of the equations) -> rates at the beginning, the state at the end, rates there."""
     equations = dynamic_with_parameters(like)
@@ -115,7 +115,7 @@ def _step(like: CarParameters) -> ca.Function:
 class Cars:
     """Some cars, each at so many places: one step of all of them at once."""
 
-    def __init__(self, like: CarParameters, numbers: Floats, places: int) -> None:
+    def __init__(self, like: Car, numbers: Floats, places: int) -> None:
         """``like``: of such tyres and mass; ``numbers`` (p, n): :class:`Numbers` of each car."""
         count = len(numbers)
         like = like.model_copy(update={"inertia_kgm2": 1.0, "drive": _MOTOR})
@@ -153,7 +153,7 @@ class Motion(NamedTuple):
 class SingleTrack:
     """The commands of some runs, and the cars that they drive through windows."""
 
-    def __init__(self, car: CarParameters, drives: Drives, periods: int) -> None:
+    def __init__(self, car: Car, drives: Drives, periods: int) -> None:
         self._car, self._step_s, self._periods = car, drives.step_s, periods
         rest = np.zeros((int(np.ceil(_REST_S / self._step_s)), 2))
         runs = [np.vstack((rest, u)) for u in drives.u]

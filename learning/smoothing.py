@@ -38,11 +38,11 @@ from scipy.special import chdtri
 
 from bayesrace.arrays import Flags, Floats, Rows
 from bayesrace.gp.expression import mean_function
-from bayesrace.gp.weights import GpWeights
+from bayesrace.gp.weights import Weights
 from bayesrace.integrators import Discretisation, pose_from_velocities
 from bayesrace.learning.drives import POSE, Drive, Event, Measured
 from bayesrace.learning.validation import NOMINAL, predictive_sigma
-from bayesrace.vehicles.parameters import CarParameters
+from bayesrace.vehicles.parameters import Car
 from bayesrace.vehicles.parts import GRAVITY_MPS2
 
 __all__ = ["Smoothed", "Steps", "blurred", "corrected_steps", "innovation", "inputs_of"]
@@ -217,7 +217,7 @@ def _backward(events: Sequence[Event], made: _Forward) -> Smoothed:
 
 
 def smooth(
-    drive: Drive, car: CarParameters, discretisation: Discretisation, weights: GpWeights | None
+    drive: Drive, car: Car, discretisation: Discretisation, weights: Weights | None
 ) -> Smoothed | None:
     """The states of a drive, by the corrected model or, without weights, by a random walk; None
     where too little was read, or the model cannot follow."""
@@ -245,7 +245,7 @@ def smooth(
     return found if drive.refused is None else replace(found, refused=drive.refused)
 
 
-def _possible(path: Floats, car: CarParameters) -> bool:
+def _possible(path: Floats, car: Car) -> bool:
     """Whether a controller would accept all of its states."""
     most = car.tuning.plausible
     bounds = np.array([
@@ -255,9 +255,7 @@ def _possible(path: Floats, car: CarParameters) -> bool:
     return bool((np.abs(path[:, :_NX]) <= bounds).all())
 
 
-def started(
-    first: Event, drive: Drive, car: CarParameters, around: Floats
-) -> tuple[Floats, Floats]:
+def started(first: Event, drive: Drive, car: Car, around: Floats) -> tuple[Floats, Floats]:
     """Mean and covariance after the first pose."""
     x, settings = around.copy(), car.tuning.estimation(nominal=True)
     p = np.diag(np.square(settings["start"]))
@@ -317,9 +315,9 @@ def blurred(events: Sequence[Event], residual: Floats, step_s: float) -> list[Ev
 def _corrected(
     events: Sequence[Event],
     path: Floats,
-    car: CarParameters,
+    car: Car,
     discretisation: Discretisation,
-    weights: GpWeights,
+    weights: Weights,
 ) -> tuple[_Transition, list[Event]]:
     """The corrected model, linearised along the path, and the events with readings as noisy as it
     takes them."""
@@ -367,9 +365,9 @@ def corrected_steps(
     begin: Floats,
     u: Floats,
     h: Floats,
-    car: CarParameters,
+    car: Car,
     discretisation: Discretisation,
-    weights: GpWeights | None,
+    weights: Weights | None,
 ) -> Steps:
     """Steps from ``x`` (n, 7) under ``u`` (n, 2) within ``h`` (n,).
 
@@ -421,7 +419,7 @@ def _jerk(h: Floats, psi: Floats) -> Floats:
     return q
 
 
-def _walked(events: Sequence[Event], drive: Drive, car: CarParameters) -> Smoothed:
+def _walked(events: Sequence[Event], drive: Drive, car: Car) -> Smoothed:
     """By the random walk of the velocities, with the noise that makes the readings most likely."""
     walk, (u, h) = _walk(), inputs_of(events)
     x0, p0 = np.zeros(_NB + 3), np.zeros((_NB + 3, _NB + 3))

@@ -47,7 +47,7 @@ from bayesrace.learning.dataset import (
 from bayesrace.learning.drives import Estimates
 from bayesrace.log import LogReader
 from bayesrace.messages import STATE, TELEMETRY, TRUTH, topic_of
-from bayesrace.vehicles import CarParameters, builtin_cars, car_text, described_car
+from bayesrace.vehicles import Car, builtin_cars, car_text, described_car
 
 __all__ = ["CYCLES", "MAX_BYTES", "STATES", "TRUE_STATES", "LogFacts", "Samples"]
 __all__ += ["dataset_from_columns", "dataset_from_log", "dataset_from_npz", "log_facts"]
@@ -88,7 +88,7 @@ class LogFacts:
     """Names in the network of the cars whose states it holds."""
     true: frozenset[str]
     """Names of the cars whose true states it holds besides the measured ones."""
-    car: CarParameters | None
+    car: Car | None
     """The recorded car; None if the log does not name it."""
     discretisation: Discretisation | None
     """The one that its controller predicted with; None if the log does not name it."""
@@ -124,7 +124,7 @@ def log_facts(path: str | os.PathLike[str]) -> LogFacts:
 def dataset_from_columns(
     states: Columns,
     cycles: Columns,
-    car: CarParameters,
+    car: Car,
     step_s: float,
     runs: Collection[int] | None = None,
     *,
@@ -188,7 +188,7 @@ def _left_out(states: Columns, cycles: Columns) -> Flags:
 
 def dataset_from_log(
     path: str | os.PathLike[str],
-    car: CarParameters,
+    car: Car,
     step_s: float,
     runs: Collection[int] | None = None,
     name: str = "",
@@ -212,9 +212,7 @@ def dataset_from_log(
 # Arrays ------------------------------------------------------------------------------------------
 
 
-def dataset_from_npz(
-    path: Path, car: CarParameters | None = None, step_s: float | None = None
-) -> Dataset:
+def dataset_from_npz(path: Path, car: Car | None = None, step_s: float | None = None) -> Dataset:
     """All samples of a file, unfiltered.
 
     ``car`` and ``step_s``: the expected ones, if given; the published form, which names neither,
@@ -260,9 +258,9 @@ class _File:
 
     path: Path
     arrays: Mapping[str, AnyArray]
-    car: CarParameters | None
+    car: Car | None
 
-    def dataset(self, car: CarParameters | None, step_s: float | None) -> Dataset:
+    def dataset(self, car: Car | None, step_s: float | None) -> Dataset:
         """The samples; InputError unless they are of this car and step."""
         try:
             dataset = self._published(car, step_s) if self._is_published() else self._own()
@@ -302,7 +300,7 @@ class _File:
         states, inputs = self.arrays["states"].shape, self.arrays["inputs"].shape
         return len(states) == 2 and states[0] in (6, 7) and inputs == (2, states[1] - 1)
 
-    def _published(self, car: CarParameters | None, step_s: float | None) -> Dataset:
+    def _published(self, car: Car | None, step_s: float | None) -> Dataset:
         """All samples of a published drive; zero columns that pad its end are left out."""
         if "dstates" not in self.arrays:
             raise InputError(
@@ -335,7 +333,7 @@ class Samples:
 
 def read_samples(
     paths: Sequence[Path],
-    car: CarParameters | None = None,
+    car: Car | None = None,
     name: str = "",
     discretisation: Discretisation | None = None,
     runs: Collection[int] | None = None,
@@ -381,8 +379,8 @@ def read_samples(
 
 
 def recorded_car(
-    paths: Sequence[Path], given: CarParameters | None, name: str
-) -> tuple[CarParameters, dict[Path, str]]:
+    paths: Sequence[Path], given: Car | None, name: str
+) -> tuple[Car, dict[Path, str]]:
     """The car that drove, ``given`` or as the logs name it, and its name in the network of each.
 
     InputError if there is none, or if a log holds no states of it.
@@ -410,14 +408,12 @@ def _driver(path: Path, facts: LogFacts, name: str) -> str:
     return names[0]
 
 
-def _cars(
-    logs: Mapping[Path, LogFacts], drivers: Mapping[Path, str]
-) -> dict[Path, CarParameters | None]:
+def _cars(logs: Mapping[Path, LogFacts], drivers: Mapping[Path, str]) -> dict[Path, Car | None]:
     """The car of each log, recorded or built in."""
     return {path: facts.car or builtin_cars().get(drivers[path]) for path, facts in logs.items()}
 
 
-def _the_car(cars: Mapping[Path, CarParameters | None]) -> CarParameters:
+def _the_car(cars: Mapping[Path, Car | None]) -> Car:
     """The only one; InputError if there are several, or none."""
     car = _common("cars", cars, lambda one: f"'{one.identity}'")
     if car is None:

@@ -28,7 +28,7 @@ from scipy.spatial.distance import cdist
 from bayesrace.arrays import Floats, Rows
 from bayesrace.errors import InputError
 from bayesrace.gp.expression import kernel
-from bayesrace.gp.weights import OUTPUTS, GpWeights
+from bayesrace.gp.weights import OUTPUTS, Weights
 from bayesrace.learning.dataset import Dataset
 
 __all__ = ["MOST_NEW", "bounded", "evenly", "most_informative", "spans", "stretches"]
@@ -87,7 +87,7 @@ def most_informative(
     return np.sort(chosen)
 
 
-def bounded(dataset: Dataset, wanted: int, weights: GpWeights | None = None) -> Dataset:
+def bounded(dataset: Dataset, wanted: int, weights: Weights | None = None) -> Dataset:
     """At most ``wanted`` of the samples, in their order: the newest, and the most informative.
 
     A quarter are the last ones; an equal part of the others is chosen for each output by its

@@ -53,7 +53,7 @@ from bayesrace.gp.weights import (
     FEATURES,
     OUTPUTS,
     GpOutput,
-    GpWeights,
+    Weights,
     encode_weights,
     read_weights,
 )
@@ -90,7 +90,7 @@ _CHECKED: Final = 200
 class Training:
     """Weights, and the scores that led to them."""
 
-    weights: GpWeights
+    weights: Weights
     kernels: tuple[KernelScore, ...]
     """Every candidate of every output, on the samples that hyperparameters are found with."""
     samples: Dataset
@@ -101,9 +101,9 @@ def train(
     dataset: Dataset,
     discretisation: Discretisation,
     settings: TrainingSettings | None = None,
-    initial: GpWeights | None = None,
+    initial: Weights | None = None,
     progress: Progress | None = None,
-) -> GpWeights:
+) -> Weights:
     """The weights of :func:`fit`."""
     return fit(dataset, discretisation, settings, initial, progress).weights
 
@@ -112,7 +112,7 @@ def fit(
     dataset: Dataset,
     discretisation: Discretisation,
     settings: TrainingSettings | None = None,
-    initial: GpWeights | None = None,
+    initial: Weights | None = None,
     progress: Progress | None = None,
 ) -> Training:
     """Weights that correct the discretised nominal model of the dataset's car.
@@ -131,7 +131,7 @@ def fit(
     if dataset.estimates is None or not dataset.estimates.drives:
         return _fit(dataset, discretisation, settings, initial, widen, report)
 
-    def learn(samples: Dataset, before: GpWeights | None) -> Training:
+    def learn(samples: Dataset, before: Weights | None) -> Training:
         return _fit(samples, discretisation, settings, before, 1.0, report)
 
     with threadpool_limits(1, "blas"):  # threads would wait for each other
@@ -145,7 +145,7 @@ def fit(
     return Training(_named(replace(found, metrics=metrics)), made.kernels, dataset)
 
 
-def _named(weights: GpWeights) -> GpWeights:
+def _named(weights: Weights) -> Weights:
     """Named by content: the same samples and settings always give the same version."""
     plain = replace(weights, version="unnamed", created_utc_ns=0, program="")
     digest = hashlib.sha256(encode_weights(plain)).hexdigest()
@@ -161,7 +161,7 @@ def _fit(
     dataset: Dataset,
     discretisation: Discretisation,
     settings: TrainingSettings,
-    initial: GpWeights | None,
+    initial: Weights | None,
     widen: float,
     report: Progress,
 ) -> Training:
@@ -205,7 +205,7 @@ def _fit(
             done = len(outputs) / len(targets)
             report(0.9 + 0.1 * done, f"{target.name}: {chosen.kind} chosen")
     checked = evenly(len(dataset), _CHECKED)
-    weights = GpWeights(
+    weights = Weights(
         version="unnamed",
         car=dataset.car.name,
         discretisation=model,
@@ -239,7 +239,7 @@ def _check(dataset: Dataset, errors: Floats) -> None:
 def _optimise(
     targets: Sequence[Target],
     settings: TrainingSettings,
-    initial: GpWeights | None,
+    initial: Weights | None,
     report: Progress,
 ) -> list[list[Fit]]:
     """The best fit of each output with each kernel; several are sought at once."""
@@ -322,7 +322,7 @@ class Outcome:
 
     error: str = ""
     """Why there are no weights; empty if there are."""
-    weights: GpWeights | None = None
+    weights: Weights | None = None
     samples: int = 0
     """Learned from."""
     moved: int = 0

@@ -20,14 +20,14 @@ from threadpoolctl import threadpool_limits
 from bayesrace.arrays import Flags, Floats, Rows
 from bayesrace.errors import InputError
 from bayesrace.gp.expression import corrected_function, evaluate_mean
-from bayesrace.gp.weights import OUTPUTS, GpWeights
+from bayesrace.gp.weights import OUTPUTS, Weights
 from bayesrace.integrators import Discretisation
 from bayesrace.learning.dataset import Dataset
 from bayesrace.learning.gaussian_process import Covariance, Posterior
 from bayesrace.learning.subset import evenly
 from bayesrace.learning.target import NORMAL_95, PredictionErrors
 from bayesrace.vehicles.models import STATES, e_kinematic
-from bayesrace.vehicles.parameters import CarParameters
+from bayesrace.vehicles.parameters import Car
 
 __all__ = ["HORIZON", "NOMINAL", "Validation", "discretisation_of", "identity", "mismatch"]
 __all__ += ["predictive_sigma", "recalled", "residual", "unbroken", "validate"]
@@ -52,7 +52,7 @@ def identity(dataset: Dataset, discretisation: Discretisation) -> str:
     return discretisation.identity(NOMINAL(dataset.car).name, dataset.car)
 
 
-def discretisation_of(name: str, car: CarParameters) -> Discretisation:
+def discretisation_of(name: str, car: Car) -> Discretisation:
     """The discretisation that an identity names, such as a manifest's or that of weights.
 
     InputError if it is not one of the nominal model of ``car``: other parameters, another model.
@@ -88,7 +88,7 @@ def residual(dataset: Dataset, discretisation: Discretisation) -> Floats:
     return dataset.x_next[:, _ROWS] - predicted[:, _ROWS]
 
 
-def recalled(weights: GpWeights, car: CarParameters) -> Dataset:
+def recalled(weights: Weights, car: Car) -> Dataset:
     """What weights know at their own training inputs, as samples of ``car``, which is theirs.
 
     For where the drives that they were learned from are not at hand. Each sample is a step of the
@@ -140,7 +140,7 @@ class Validation:
         return np.asarray(self.sigma.max(axis=1) > threshold)
 
 
-def predictive_sigma(weights: GpWeights, z: Floats) -> Floats:
+def predictive_sigma(weights: Weights, z: Floats) -> Floats:
     """Predictive standard deviation (m, 3) at features ``z`` (m, 6), noise included, SI units."""
     columns = []
     for output in weights.outputs:
@@ -153,7 +153,7 @@ def predictive_sigma(weights: GpWeights, z: Floats) -> Floats:
     return np.column_stack(columns)
 
 
-def validate(weights: GpWeights, dataset: Dataset, discretisation: Discretisation) -> Validation:
+def validate(weights: Weights, dataset: Dataset, discretisation: Discretisation) -> Validation:
     """Compares prediction and residual on ``dataset``.
 
     InputError without samples, if the weights are for another discretised model, or if a metric is
@@ -196,7 +196,7 @@ def unbroken(dataset: Dataset, steps: int) -> Rows:
 def mismatch(
     dataset: Dataset,
     discretisation: Discretisation,
-    weights: GpWeights | None,
+    weights: Weights | None,
     steps: int = HORIZON,
 ) -> Floats:
     """Driven minus predicted states after ``steps`` steps, open loop, (m, 7), SI units.

@@ -17,7 +17,7 @@ from bayesrace.errors import InputError
 from bayesrace.learning.instruments import Drives, Windows, cut
 from bayesrace.learning.single_track import Numbers, SingleTrack
 from bayesrace.messages import QUANTITIES
-from bayesrace.vehicles import CarParameters
+from bayesrace.vehicles import Car
 from bayesrace.vehicles.parts import GRAVITY_MPS2, DcMotor, PacejkaTyres
 
 __all__ = ["Fit", "polynomials", "states_of"]
@@ -58,7 +58,7 @@ class _Number(NamedTuple):
     prior: float = np.inf
 
 
-def _free(car: CarParameters, wheelbase: bool, measured: set[str]) -> dict[str, _Number]:
+def _free(car: Car, wheelbase: bool, measured: set[str]) -> dict[str, _Number]:
     """What is to be found of :class:`Numbers`."""
     drive, size, gain = car.drive, car.friction * GRAVITY_MPS2, 1.0
     free = {"a3": _Number(0, -size, size, size), "a4": _Number(0, -np.inf, np.inf, 0.1)}
@@ -89,7 +89,7 @@ def _free(car: CarParameters, wheelbase: bool, measured: set[str]) -> dict[str, 
 class Fit:
     """The numbers of the car, the states of its windows, and the noise of the instruments."""
 
-    def __init__(self, car: CarParameters, drives: Drives, *, wheelbase: bool) -> None:
+    def __init__(self, car: Car, drives: Drives, *, wheelbase: bool) -> None:
         """``car``: on tyres of the model that is to be found."""
         self.car, self.drives, instruments = car, drives, len(drives.instruments)
         measured = {QUANTITIES[of] for of in np.unique(drives.readings["of"])}

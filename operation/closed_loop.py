@@ -50,7 +50,7 @@ from bayesrace.raceline import RaceLine
 from bayesrace.realtime import uncollected
 from bayesrace.sensors import EXACT, Sensors
 from bayesrace.tracks import PathProjection, Track
-from bayesrace.vehicles import CarParameters
+from bayesrace.vehicles import Car
 from bayesrace.vehicles.models import dynamic
 
 __all__ = ["ClosedLoop", "Driven", "Watch", "built_in_car"]
@@ -70,7 +70,7 @@ _LIMIT_S: Final = 2.0
 class Driven(Trajectory):
     """One run: the truth, what was measured of it, and what the controller decided."""
 
-    car: CarParameters
+    car: Car
     track: Track
     step_s: float
     states: list[State]
@@ -153,7 +153,7 @@ class Driven(Trajectory):
         return text + (f", {self.fallbacks} fallbacks" if self.fallbacks else "")
 
 
-def built_in_car(car: CarParameters, world: World = UNCHANGED) -> Simulator:
+def built_in_car(car: Car, world: World = UNCHANGED) -> Simulator:
     """The car by the built-in equations, compiled; several loops in turn may drive it."""
     return Simulator(dynamic(car), compiled=compiled, world=world)
 
@@ -163,7 +163,7 @@ class ClosedLoop:
 
     def __init__(
         self,
-        car: CarParameters,
+        car: Car,
         track: Track,
         line: RaceLine,
         controller: Controller,

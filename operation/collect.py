@@ -33,7 +33,7 @@ from bayesrace.raceline.friction import timed_line
 from bayesrace.sensors import EXACT, Sensors
 from bayesrace.tracks import Track, load_track
 from bayesrace.tracks.spline import fit_arc_length
-from bayesrace.vehicles import CarParameters, car_text
+from bayesrace.vehicles import Car, car_text
 
 __all__ = [
     "collect", "drive_length_s", "practise", "pursuit_controller", "room_beside", "slower_before",
@@ -72,7 +72,7 @@ _THINNED: Final = 4
 def collect(
     track: Track,
     line: RaceLine,
-    car: CarParameters,
+    car: Car,
     artefact: Path,
     path: Path,
     duration_s: float,
@@ -137,7 +137,7 @@ def collect(
 def practise(
     track: Track,
     line: RaceLine,
-    car: CarParameters,
+    car: Car,
     controller: Controller,
     path: Path,
     laps: int,
@@ -168,12 +168,12 @@ def practise(
     return driven
 
 
-def _log_of(path: Path, track: Track, car: CarParameters) -> LogWriter:
+def _log_of(path: Path, track: Track, car: Car) -> LogWriter:
     """Names the car, so that what is learned from the log is learned of this one."""
     return LogWriter(path, {"collect": {"track": track.name, "car": car_text(car)}})
 
 
-def _until_it_fails(track: Track, car: CarParameters) -> Watch:
+def _until_it_fails(track: Track, car: Car) -> Watch:
     """Ends a drive where the true car leaves the track or spins."""
     return lambda x: _FAILED if _failing(track, car, np.array([x]))[0] else None
 
@@ -191,7 +191,7 @@ def _slower_after(one: Driven, line: RaceLine, slowed: Floats) -> tuple[Floats, 
     return same, _EVERYWHERE if lost or wrong.any() else 1.0
 
 
-def _failing(track: Track, car: CarParameters, x: Floats) -> Flags:
+def _failing(track: Track, car: Car, x: Floats) -> Flags:
     """Which of the states (n, 7) are off the track, or those of a spin."""
     moving = np.hypot(x[:, 3], x[:, 4]) > car.tuning.gate.moving_mps
     spinning = np.abs(np.arctan2(x[:, 4], x[:, 3])) > car.tuning.gate.spin_rad
@@ -203,7 +203,7 @@ def _nearest(line: RaceLine, x: Floats) -> int:
     return int(np.argmin(np.sum((line.xy_m - x[:2]) ** 2, axis=1)))
 
 
-def slower_before(line: RaceLine, x: Floats, car: CarParameters) -> Floats:
+def slower_before(line: RaceLine, x: Floats, car: Car) -> Floats:
     """Shares of the line's speeds, (n,), by which the car is to be slower before the state ``x``
     (7,)."""
     begin = _nearest(line, x)
@@ -217,7 +217,7 @@ def slower_before(line: RaceLine, x: Floats, car: CarParameters) -> Floats:
 
 def pursuit_controller(
     artefact: Path,
-    car: CarParameters,
+    car: Car,
     track: str,
     raceline: Path,
     speed_scale: float,
@@ -238,14 +238,14 @@ def pursuit_controller(
     return controller
 
 
-def training_margin_m(track: Track, car: CarParameters, margin_m: float | None = None) -> float:
+def training_margin_m(track: Track, car: Car, margin_m: float | None = None) -> float:
     """Margin of a racing line that is made for a training drive; no less than ``margin_m``."""
     narrowest_m = float(np.min(track.width_right_m + track.width_left_m))
     room_m = min(car.tuning.pursuit.keep_m, _MOST * narrowest_m)
     return max(room_m, car.width_m / 2 if margin_m is None else margin_m)
 
 
-def drive_length_s(car: CarParameters, line: RaceLine, sensors: Sensors = EXACT) -> float:
+def drive_length_s(car: Car, line: RaceLine, sensors: Sensors = EXACT) -> float:
     """Length of training drives along a line, by default: a lap at least; longer where states are
     estimated, as such a sample says less."""
     if not sensors.root:
@@ -253,14 +253,12 @@ def drive_length_s(car: CarParameters, line: RaceLine, sensors: Sensors = EXACT)
     return max(_ESTIMATED * car.tuning.pursuit.drive_s, _ESTIMATED_LAPS * line.lap_time_s)
 
 
-def _lap_length_s(car: CarParameters, line: RaceLine) -> float:
+def _lap_length_s(car: Car, line: RaceLine) -> float:
     """Length of a drive that passes all of a line."""
     return max(car.tuning.pursuit.drive_s, _LAPS * line.lap_time_s)
 
 
-def training_line(
-    track: Track, line: RaceLine, car: CarParameters, style: DrivingStyle
-) -> RaceLine:
+def training_line(track: Track, line: RaceLine, car: Car, style: DrivingStyle) -> RaceLine:
     """What a training drive follows: a racing line; where that is too near to the edges, the same
     moved inwards; or one that weaves about it. No faster than friction and the given line allow.
     """
@@ -286,7 +284,7 @@ def room_beside(track: Track, line: RaceLine) -> tuple[Floats, Floats]:
     return right + near.n_m, left - near.n_m
 
 
-def _moved(track: Track, line: RaceLine, car: CarParameters, by_m: Floats) -> RaceLine:
+def _moved(track: Track, line: RaceLine, car: Car, by_m: Floats) -> RaceLine:
     """The line moved to the left by so much at each point (n,), with speeds for its bends."""
     normal = track.normal(track.project_path(line.xy_m).s_m)
     path = fit_arc_length((line.xy_m + by_m[:, None] * normal)[::_THINNED])

@@ -13,7 +13,7 @@ from bayesrace.raceline import same_track
 from bayesrace.recorder import Recorder
 from bayesrace.tracks import StartLine, Track
 from bayesrace.transport import Director, Endpoints, Publisher, RefusedError, open_session
-from bayesrace.vehicles import CarParameters, car_text
+from bayesrace.vehicles import Car, car_text
 
 __all__ = ["RunPlan", "announcement", "drive_and_judge", "execute", "run_request"]
 
@@ -137,7 +137,7 @@ def execute(
 
 
 def drive_and_judge(
-    endpoints: Endpoints, car: CarParameters, name: str, track: Track, plan: RunPlan, log: Path
+    endpoints: Endpoints, car: Car, name: str, track: Track, plan: RunPlan, log: Path
 ) -> tuple[Event, Verdict]:
     """The next run, after those before, of the processes that wait, with a log: its end, and the
     verdict. ``name``: the car's in the network. Raises as :func:`execute`."""

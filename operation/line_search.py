@@ -18,7 +18,7 @@ from bayesrace.raceline import RaceLine, RaceLineSettings, racing_line
 from bayesrace.raceline.friction import NodeLines, roughness
 from bayesrace.raceline.line import line_identity
 from bayesrace.tracks import Track, load_track
-from bayesrace.vehicles import CarParameters
+from bayesrace.vehicles import Car
 
 __all__ = ["Lap", "SearchedLine", "driven_lap", "searched_line"]
 
@@ -46,7 +46,7 @@ def _ideal_lap(line: RaceLine) -> float:
     return line.lap_time_s
 
 
-def driven_lap(artefact: Path, weights: Path | None, track: Track, car: CarParameters) -> Lap:
+def driven_lap(artefact: Path, weights: Path | None, track: Track, car: Car) -> Lap:
     """The flying lap that the controller drives in simulation along a line, after one lap from
     standstill; infinite where it does not finish in good time or leaves the track.
 
@@ -67,7 +67,7 @@ def driven_lap(artefact: Path, weights: Path | None, track: Track, car: CarParam
 
 def searched_line(
     name: str,
-    car: CarParameters,
+    car: Car,
     settings: BayesianSettings,
     stages: Stages,
     weights: Path | None = None,

@@ -34,7 +34,7 @@ from bayesrace.operation.training_drives import (
     training_track,
 )
 from bayesrace.tracks import load_track
-from bayesrace.vehicles import CarParameters
+from bayesrace.vehicles import Car
 
 __all__ = [
     "Prepared",
@@ -165,9 +165,7 @@ def _learned(
     return training, practices, weights
 
 
-def _lost(
-    artefact: Path, car: CarParameters, races: Sequence[PreparedTrack], weights: Path
-) -> float:
+def _lost(artefact: Path, car: Car, races: Sequence[PreparedTrack], weights: Path) -> float:
     """Of a lap, the largest share that a race loses where its line is faster than what the weights
     know."""
     learned, lost = read_weights(weights), 0.0

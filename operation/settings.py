@@ -13,7 +13,7 @@ from bayesrace.integrators import PREDICTION, Discretisation
 from bayesrace.learning.settings import DEFAULT_KERNELS, WIDEN, Kernel
 from bayesrace.plant.settings import CarSimulation
 from bayesrace.raceline import RaceLineSettings
-from bayesrace.vehicles import CarParameters
+from bayesrace.vehicles import Car
 
 __all__ = ["BayesianSettings", "PreparationSettings", "RaceSettings", "TimeMode"]
 
@@ -96,13 +96,13 @@ class PreparationSettings(CarSimulation):
         return self
 
     @property
-    def driven_car(self) -> CarParameters:
+    def driven_car(self) -> Car:
         """With the friction that the line is asked for: the controller must assume the same."""
         grip = self.raceline.friction
         return self.car if grip is None else self.car.model_copy(update={"friction": grip})
 
     @property
-    def true_car(self) -> CarParameters:
+    def true_car(self) -> Car:
         """What the plant simulates and BestCase knows: the driven car with its true tyres."""
         car = self.driven_car
         if self.true_grip == 1:

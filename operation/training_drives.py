@@ -43,7 +43,7 @@ from bayesrace.raceline import (
 from bayesrace.raceline.friction import timed_line
 from bayesrace.tracks import Track, write_track
 from bayesrace.tracks.spline import fit_arc_length
-from bayesrace.vehicles import CarParameters
+from bayesrace.vehicles import Car
 
 __all__ = [
     "LARGER",
@@ -116,7 +116,7 @@ def place(name: str, packages: Sequence[str], *inputs: str | bytes) -> Path:
 
 
 def prepared_track(
-    track: Track, car: CarParameters, settings: RaceLineSettings, line_file: Path | None = None
+    track: Track, car: Car, settings: RaceLineSettings, line_file: Path | None = None
 ) -> PreparedTrack:
     """The racing line computed, from the cache, or from the file that is given."""
     cached = raceline_file(track, car, settings)
@@ -131,7 +131,7 @@ def larger_course(
     on: PreparedTrack,
     size: float,
     known: Coverage,
-    car: CarParameters,
+    car: Car,
     settings: RaceLineSettings,
 ) -> tuple[float, PreparedTrack] | None:
     """The smallest copy of the training track, of those that are larger than ``size`` times, on
@@ -175,7 +175,7 @@ def _track_beside(line_file: Path, track: Track) -> Path:
     return file
 
 
-def training_track(track: Track, car: CarParameters, settings: RaceLineSettings) -> PreparedTrack:
+def training_track(track: Track, car: Car, settings: RaceLineSettings) -> PreparedTrack:
     """With a racing line that leaves room for a training drive, or as much as the track allows."""
     margin_m = training_margin_m(track, car, settings.margin_m)
     for share in _ROOM_SHARES:
@@ -186,7 +186,7 @@ def training_track(track: Track, car: CarParameters, settings: RaceLineSettings)
 
 
 def training_drive(
-    on: PreparedTrack, car: CarParameters, settings: PreparationSettings, artefact: Path
+    on: PreparedTrack, car: Car, settings: PreparationSettings, artefact: Path
 ) -> Training:
     """The pure-pursuit drive, from the cache if it is there; its log is like a race's."""
 
@@ -199,7 +199,7 @@ def training_drive(
 
 def practice(
     on: PreparedTrack,
-    car: CarParameters,
+    car: Car,
     settings: PreparationSettings,
     artefact: Path,
     weights: Path,
@@ -227,7 +227,7 @@ def practice(
 def _kept_drive(
     name: str,
     on: PreparedTrack,
-    car: CarParameters,
+    car: Car,
     settings: PreparationSettings,
     make: Callable[[Path], None],
     *inputs: str,
@@ -258,7 +258,7 @@ def _kept_drive(
     return Training(on, path, kept(path, make, read))
 
 
-def _drive_s(settings: PreparationSettings, car: CarParameters, line: RaceLine) -> float:
+def _drive_s(settings: PreparationSettings, car: Car, line: RaceLine) -> float:
     """Length of the training drives."""
     return settings.collect_s or drive_length_s(car, line, settings.instruments)
 
@@ -267,7 +267,7 @@ def drive_for_training(
     settings: PreparationSettings,
     track: Track,
     line: RaceLine,
-    car: CarParameters,
+    car: Car,
     artefact: Path,
     log: Path,
 ) -> list[Driven]:

@@ -22,7 +22,7 @@ from bayesrace.errors import InputError
 from bayesrace.integrators import PLANT_SUBSTEP_HZ
 from bayesrace.messages import MOST_READINGS, Reading
 from bayesrace.plant.vehicle import Command, Vehicle
-from bayesrace.vehicles.parameters import CarParameters
+from bayesrace.vehicles.parameters import Car
 
 __all__ = ["Hardware", "Report"]
 
@@ -104,7 +104,7 @@ class Hardware(Vehicle):
 
     def __init__(
         self,
-        car: CarParameters,
+        car: Car,
         rate_hz: float = 50.0,
         delays_s: Mapping[str, float] | None = None,
         command_s: float = 0.0,

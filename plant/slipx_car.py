@@ -20,7 +20,7 @@ from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
 from bayesrace.plant.simulator import plant_discretisation
 from bayesrace.plant.vehicle import Command, FmuFault, Vehicle
-from bayesrace.vehicles.parameters import CarParameters
+from bayesrace.vehicles.parameters import Car
 
 __all__ = ["SlipxSimulator"]
 
@@ -31,7 +31,7 @@ _TOLERANCE: Final = 0.01
 class SlipxSimulator(Vehicle):
     """slipx' reference car that advances by one sampling period per call; see ``plant.vehicle``."""
 
-    def __init__(self, car: CarParameters, rate_hz: float = 50.0) -> None:
+    def __init__(self, car: Car, rate_hz: float = 50.0) -> None:
         """``car``: whose limits the guard keeps; InputError if it is not the reference car."""
         discretisation = plant_discretisation(rate_hz)
         super().__init__(car, discretisation.step_s, discretisation.substeps)
@@ -43,7 +43,7 @@ class SlipxSimulator(Vehicle):
         self._input: Any = slipx.DriveInput()
         self._check(car)
 
-    def _check(self, car: CarParameters) -> None:
+    def _check(self, car: Car) -> None:
         theirs = self._parameters
         names = {"lf_m": theirs.lf, "lr_m": theirs.lr, "mass_kg": theirs.mass}
         for name, value in names.items():

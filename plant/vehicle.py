@@ -22,7 +22,7 @@ from bayesrace.errors import InputError
 from bayesrace.messages import BrakingPlan, Reading
 from bayesrace.plant.settings import SimulatorName
 from bayesrace.plant.world import UNCHANGED, World
-from bayesrace.vehicles.parameters import CarParameters
+from bayesrace.vehicles.parameters import Car
 
 if TYPE_CHECKING:
     import casadi as ca
@@ -102,7 +102,7 @@ class GuardCounters:
 class PlantGuard:
     """Turns any command into one that the car's actuators can follow for one period."""
 
-    def __init__(self, car: CarParameters) -> None:
+    def __init__(self, car: Car) -> None:
         self._d_min, self._d_max, self._drive = car.d_min, car.d_max, car.drive
         self._rate_max = car.delta_rate_max_radps
         self._delta_max = car.delta_max_rad
@@ -170,7 +170,7 @@ class Vehicle(ABC):
     command_s: float = 0.0
     """From sending a command to its acting."""
 
-    def __init__(self, car: CarParameters, step_s: float, substeps: int) -> None:
+    def __init__(self, car: Car, step_s: float, substeps: int) -> None:
         self.car = car
         """Whose limits the guard keeps."""
         self.step_s = step_s
@@ -265,7 +265,7 @@ class Vehicle(ABC):
 
 @contextmanager
 def open_vehicle(
-    car: CarParameters,
+    car: Car,
     fmu: Path | None = None,
     fmu_map: Path | None = None,
     rate_hz: float = 50.0,

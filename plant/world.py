@@ -21,7 +21,7 @@ from pydantic import (
 from bayesrace.defaults import Option
 from bayesrace.errors import InputError
 from bayesrace.files import read_form, write_whole
-from bayesrace.vehicles import CarParameters
+from bayesrace.vehicles import Car
 from bayesrace.vehicles.parts import DcMotor
 
 __all__ = ["NONE", "UNCHANGED", "Change", "World", "WorldSetting", "changed_car", "get_world"]
@@ -101,7 +101,7 @@ class World(RootModel[tuple[Change, ...]]):
             products[one.what] *= one.share_at(time_s, x_m, y_m)
         return tuple(products.values())
 
-    def check(self, car: CarParameters) -> None:
+    def check(self, car: Car) -> None:
         """InputError if this car has no motor whose force could change."""
         if any(one.what == "motor" for one in self.root) and not isinstance(car.drive, DcMotor):
             raise InputError(
@@ -116,7 +116,7 @@ NONE: Final = "none"
 """In place of a file, where one has to be named."""
 
 
-def changed_car(car: CarParameters, shares: tuple[float, ...]) -> CarParameters:
+def changed_car(car: Car, shares: tuple[float, ...]) -> Car:
     """The car with these shares of its grip, mass and motor."""
     grip, mass, motor = shares
     drive = car.drive

@@ -31,7 +31,7 @@ from bayesrace.controller.native_step import NativeStep, StepStatus
 from bayesrace.controller.process_settings import ControllerSettings
 from bayesrace.controller.settings import MpcSettings
 from bayesrace.gp.expression import corrected_function
-from bayesrace.gp.weights import GpWeights, read_weights
+from bayesrace.gp.weights import Weights, read_weights
 from bayesrace.integrators import PREDICTION, Discretisation
 from bayesrace.messages import State
 from bayesrace.operation.closed_loop import built_in_car
@@ -43,7 +43,7 @@ from bayesrace.plant.simulator import PLANT
 from bayesrace.plant.vehicle import Vehicle
 from bayesrace.studies.settings import PUBLISHED, BenchSettings
 from bayesrace.tracks import Track
-from bayesrace.vehicles import CarParameters
+from bayesrace.vehicles import Car
 from bayesrace.vehicles.models import e_kinematic
 
 __all__ = ["BenchResult", "BenchSettings", "run_bench"]
@@ -230,7 +230,7 @@ class _Drive:
     def __init__(
         self,
         problem: ProblemName,
-        car: CarParameters,
+        car: Car,
         mpc: MpcSettings,
         make: Callable[[], PredictiveController],
     ) -> None:
@@ -328,7 +328,7 @@ def _row(problem: ProblemName, caution: float, part: Part, steps: list[_Steps]) 
 
 
 def _peer(
-    settings: BenchSettings, weights: GpWeights, solutions: list[_Solution], step_p50: float,
+    settings: BenchSettings, weights: Weights, solutions: list[_Solution], step_p50: float,
     stages: Stages,
 ) -> Peer:  # fmt: skip
     """IPOPT, on steps evenly spread among these."""

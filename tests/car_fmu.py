@@ -13,7 +13,7 @@ from bayesrace.cache import cpu_identity, software
 from bayesrace.codegen.compiler import FLAGS, find_compiler
 from bayesrace.codegen.fmu import car_fmu, pack
 from bayesrace.plant.simulator import Simulator, plant_discretisation
-from bayesrace.vehicles import CarParameters, get_car
+from bayesrace.vehicles import Car, get_car
 from bayesrace.vehicles.models import STATES, dynamic
 from tests.fmu_master import Slave
 from tests.shared import shared_folder
@@ -82,7 +82,7 @@ def driven(car: Slave, inputs: Commands, h: float = 0.02) -> Floats:
 
 
 def built_in(
-    car: CarParameters, inputs: Commands, h: float = 0.02, x0: Sequence[float] = (0.0,) * 7
+    car: Car, inputs: Commands, h: float = 0.02, x0: Sequence[float] = (0.0,) * 7
 ) -> Floats:
     """The same from the built-in plant."""
     simulator = Simulator(dynamic(car), plant_discretisation(1 / h))

@@ -3,19 +3,19 @@
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from bayesrace.vehicles import CarParameters
+from bayesrace.vehicles import Car
 
 __all__ = ["with_numbers"]
 
 
-def with_numbers(car: CarParameters, values: Mapping[str, float]) -> CarParameters:
+def with_numbers(car: Car, values: Mapping[str, float]) -> Car:
     """The car with these numbers, by flat names such as ``mass_kg``, ``cm1`` or ``front_b``."""
     data = car.model_dump()
     places = {name: (place, key) for name, place, key in _places(data, "")}
     for name, value in values.items():
         place, key = places[name]
         place[key] = value
-    return CarParameters.model_validate(data)
+    return Car.model_validate(data)
 
 
 def _places(data: dict[str, Any], before: str) -> Iterator[tuple[str, dict[str, Any], str]]:

@@ -8,7 +8,7 @@ import numpy as np
 
 from bayesrace.codegen.compiler import compiled
 from bayesrace.plant.simulator import Simulator
-from bayesrace.vehicles import CarParameters
+from bayesrace.vehicles import Car
 from bayesrace.vehicles.models import Model, dynamic
 
 __all__ = ["CHANGES", "changed", "trimmed"]
@@ -16,12 +16,12 @@ __all__ = ["CHANGES", "changed", "trimmed"]
 TRIM_RAD: Final = float(np.deg2rad(1.0))
 
 
-def _motor(car: CarParameters, share: float) -> CarParameters:
+def _motor(car: Car, share: float) -> Car:
     force = {name: share * getattr(car.drive, name) for name in ("cm1", "cm2")}
     return car.model_copy(update={"drive": car.drive.model_copy(update=force)})
 
 
-CHANGES: Final[Mapping[str, Callable[[CarParameters], CarParameters]]] = {
+CHANGES: Final[Mapping[str, Callable[[Car], Car]]] = {
     "as in the file": lambda car: car,
     "wheelbase + 10 %": lambda car: car.model_copy(
         update={"lf_m": 1.1 * car.lf_m, "lr_m": 1.1 * car.lr_m}
@@ -35,7 +35,7 @@ CHANGES: Final[Mapping[str, Callable[[CarParameters], CarParameters]]] = {
 }
 
 
-def changed(car: CarParameters, how: str) -> Simulator:
+def changed(car: Car, how: str) -> Simulator:
     """The car that drives."""
     turned = TRIM_RAD if how == "trim 1 degree" else 0.0
     return Simulator(trimmed(dynamic(CHANGES[how](car)), turned), compiled=compiled)

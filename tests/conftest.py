@@ -26,11 +26,11 @@ from bayesrace.controller.native_step import NativeStep
 from bayesrace.controller.settings import MpcSettings
 from bayesrace.errors import InputError
 from bayesrace.gp.expression import kernel_matrix
-from bayesrace.gp.weights import KERNELS, GpOutput, GpWeights
+from bayesrace.gp.weights import KERNELS, GpOutput, Weights
 from bayesrace.integrators import PREDICTION, Discretisation
 from bayesrace.raceline.line import RaceLine
 from bayesrace.tracks import Track
-from bayesrace.vehicles import CarParameters, get_car
+from bayesrace.vehicles import Car, get_car
 from bayesrace.vehicles.models import Model, dynamic, e_kinematic
 from tests.command_line import cli
 from tests.programs import Race, leftovers, peanut
@@ -107,7 +107,7 @@ def discrete(
     return lambda x, u: np.asarray(function(x, u), dtype=float).ravel()
 
 
-def smooth_drive(car: CarParameters, count: int, seed: int) -> tuple[Floats, Floats]:
+def smooth_drive(car: Car, count: int, seed: int) -> tuple[Floats, Floats]:
     """States (count, 7) and inputs (count, 2) of the dynamic model under smooth random driving."""
     random, step = np.random.default_rng(seed), discrete(dynamic(car))
     x, u = np.array([0.0, 0, 0, 1.5, 0, 0, 0]), np.array([0.5, 0.0])
@@ -140,9 +140,7 @@ def fit_output(kind: str, z: Floats, y: Floats) -> GpOutput:
     )
 
 
-def fit_weights(
-    car: CarParameters, kinds: tuple[str, str, str], count: int = 160, seed: int = 1
-) -> GpWeights:
+def fit_weights(car: Car, kinds: tuple[str, str, str], count: int = 160, seed: int = 1) -> Weights:
     """Weights learned from the one-step error of the e-kinematic model on a random drive."""
     states, inputs = smooth_drive(car, count + 1, seed)
     nominal = discrete(e_kinematic(car), PREDICTION)
@@ -151,7 +149,7 @@ def fit_weights(
     z = np.column_stack([states[:-1, 3:7], inputs[:-1]])
     vx, vy, omega = (fit_output(kinds[j], z, residual[:, j]) for j in range(3))
     identity = PREDICTION.identity("e_kinematic", car)
-    return GpWeights(
+    return Weights(
         version="-".join(kinds),
         car=car.name,
         discretisation=identity,
@@ -161,7 +159,7 @@ def fit_weights(
     )
 
 
-def mirrored_weights(weights: GpWeights) -> GpWeights:
+def mirrored_weights(weights: Weights) -> Weights:
     """The weights that the mirrored car would have learned."""
     signs = np.r_[MIRROR_STATE[3:], MIRROR_INPUT]
     vx, vy, omega = (
@@ -225,7 +223,7 @@ class Circuit:
 
 
 @pytest.fixture(scope="session")
-def car() -> CarParameters:
+def car() -> Car:
     """The 1:43 car."""
     return get_car("orca")
 
@@ -243,12 +241,12 @@ def dynamic_artefact() -> Path:
 
 
 @pytest.fixture(scope="session")
-def weights(car: CarParameters) -> GpWeights:
+def weights(car: Car) -> Weights:
     """Plausible weights of 160 points with three different kernels."""
     return fit_weights(car, ("rbf", "matern25", "matern15"))
 
 
-def native_numbers(settings: MpcSettings, car: CarParameters, weights: GpWeights) -> Floats:
+def native_numbers(settings: MpcSettings, car: Car, weights: Weights) -> Floats:
     """Parameters and weights in the order of the C structures, as the C programs read them."""
     values = settings.parameters(car)
     problem = tracking(e_kinematic(car), PREDICTION)
@@ -296,7 +294,7 @@ def drive(
 
 
 def ready(
-    artefact: Path, car: CarParameters, weights: GpWeights, circuit: Circuit, settings: MpcSettings
+    artefact: Path, car: Car, weights: Weights, circuit: Circuit, settings: MpcSettings
 ) -> NativeStep:
     """A GP controller on the circuit."""
     step = NativeStep(artefact, car, settings)
@@ -309,12 +307,10 @@ Make = Callable[..., NativeStep]
 
 
 @pytest.fixture
-def make(
-    kinematic_artefact: Path, car: CarParameters, weights: GpWeights, circuit: Circuit
-) -> Make:
+def make(kinematic_artefact: Path, car: Car, weights: Weights, circuit: Circuit) -> Make:
     """Makes a GP controller on the circuit, with other weights and changes of the settings."""
 
-    def made(weights: GpWeights = weights, **changes: float) -> NativeStep:
+    def made(weights: Weights = weights, **changes: float) -> NativeStep:
         changed = SETTINGS.model_copy(update=changes)
         return ready(kinematic_artefact, car, weights, circuit, changed)
 
@@ -329,7 +325,7 @@ def native(make: Make) -> NativeStep:
 
 @pytest.fixture(scope="session")
 def recorded(
-    kinematic_artefact: Path, car: CarParameters, weights: GpWeights, circuit: Circuit
+    kinematic_artefact: Path, car: Car, weights: Weights, circuit: Circuit
 ) -> list[Problem]:
     """Problems of 300 closed-loop steps with the GP, constraints on: about two laps."""
     step = NativeStep(kinematic_artefact, car, SETTINGS)

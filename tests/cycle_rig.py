@@ -10,7 +10,7 @@ from bayesrace.controller.interface import Environment, StepOutput
 from bayesrace.controller.process_settings import ControllerSettings
 from bayesrace.controller.python_controller import PythonController
 from bayesrace.messages import State
-from bayesrace.vehicles import CarParameters, default_car
+from bayesrace.vehicles import Car, default_car
 from tests import sample_messages as messages
 
 __all__ = ["STEP_S", "ScriptedLaw", "scripted_driver", "state"]
@@ -47,7 +47,7 @@ class ScriptedLaw:
 
 
 def scripted_driver(
-    artefact: Path, law: ScriptedLaw, car: CarParameters | None = None, **settings: Any
+    artefact: Path, law: ScriptedLaw, car: Car | None = None, **settings: Any
 ) -> Driver:
     """The car's, by default the default car's, driven by the law; with settings of the process."""
     # Without a monitor: the states of these rigs follow no kinematics.

@@ -21,12 +21,12 @@ from bayesrace.controller.driver import Driver
 from bayesrace.controller.native_step import NativeStep, StepStatus
 from bayesrace.controller.process_settings import ControllerSettings
 from bayesrace.controller.settings import CompensationSettings, FallbackSettings
-from bayesrace.gp.weights import GpWeights
+from bayesrace.gp.weights import Weights
 from bayesrace.messages import Reading
 from bayesrace.plant.sensors import SensorPlayer
 from bayesrace.plant.simulator import Simulator
 from bayesrace.sensors import EXACT, Sensors
-from bayesrace.vehicles import CarParameters
+from bayesrace.vehicles import Car
 from bayesrace.vehicles.models import STATES, dynamic
 from tests import sample_messages as messages
 from tests.conftest import SETTINGS, Circuit
@@ -61,7 +61,7 @@ class Lockstep:
     """Driver and plant in one process, as the two processes of a lockstep run have them."""
 
     native: NativeStep
-    car: CarParameters
+    car: Car
     delay_s: float = 0.0
     tolerance: float = 1.0
     """Of the sensors; 0: every state is believed."""
@@ -124,9 +124,9 @@ class Exported:
     shared: Path
     """With the test processes beside this one: they take seconds to compile."""
     artefact: Path
-    car: CarParameters
+    car: Car
     circuit: Circuit
-    weights: GpWeights
+    weights: Weights
 
     def define(self, **changes: Any) -> FmuDefinition:
         """The controller's definition."""
@@ -170,9 +170,9 @@ class Exported:
 def exported_controllers(
     tmp_path_factory: pytest.TempPathFactory,
     kinematic_artefact: Path,
-    car: CarParameters,
+    car: Car,
     circuit: Circuit,
-    weights: GpWeights,
+    weights: Weights,
 ) -> Exported:
     base = tmp_path_factory.getbasetemp()
     shared = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base

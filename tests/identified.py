@@ -34,7 +34,7 @@ from bayesrace.operation.terminal.terminal import stages_on
 from bayesrace.plant.sensors import SensorPlayer
 from bayesrace.raceline import racing_line
 from bayesrace.sensors import BUILT_IN, Sensors
-from bayesrace.vehicles import CarParameters, car_text, get_car
+from bayesrace.vehicles import Car, car_text, get_car
 
 __all__ = ["NOISES", "TRIM", "coasted", "exact", "plain", "poses", "prepared_for", "raced", "seen"]
 
@@ -128,7 +128,7 @@ def coasted(duration_s: float, slowest_mps: float) -> Driven:
     return replace(driven, states=states, true_x=true_x)
 
 
-def raced(true: CarParameters, car: CarParameters, folder: Path) -> Driven:
+def raced(true: Car, car: Car, folder: Path) -> Driven:
     """Three laps of ``true`` by a controller that knows ``car``, and has learned with it."""
     files, settings = prepared_for(true.name), PreparationSettings(car=car)
     assert files.training is not None

@@ -9,14 +9,14 @@ from rich.console import Console
 
 from bayesrace.arrays import Floats
 from bayesrace.controller.assembly import PredictiveController, compiled_controller
-from bayesrace.gp.weights import GpWeights, read_weights
+from bayesrace.gp.weights import Weights, read_weights
 from bayesrace.operation.closed_loop import ClosedLoop, Driven
 from bayesrace.operation.preparation import Prepared, prepare
 from bayesrace.operation.settings import PreparationSettings
 from bayesrace.operation.terminal.terminal import stages_on
 from bayesrace.raceline import RaceLine
 from bayesrace.tracks import Track
-from bayesrace.vehicles import CarParameters, get_car
+from bayesrace.vehicles import Car, get_car
 
 __all__ = ["Racing", "prepared", "racing"]
 
@@ -25,11 +25,11 @@ __all__ = ["Racing", "prepared", "racing"]
 class Racing:
     """The car, its track, what it has learned on another one, and a lap with that."""
 
-    car: CarParameters
+    car: Car
     track: Track
     line: RaceLine
     artefact: Path
-    weights: GpWeights
+    weights: Weights
     driven: Driven
 
     def controller(self) -> PredictiveController:

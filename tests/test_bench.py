@@ -11,10 +11,10 @@ import pytest
 
 from bayesrace.controller.assembly import compiled_controller
 from bayesrace.controller.settings import MpcSettings
-from bayesrace.gp.weights import GpWeights
+from bayesrace.gp.weights import Weights
 from bayesrace.operation.closed_loop import ClosedLoop
 from bayesrace.studies.bench import _Drive
-from bayesrace.vehicles import CarParameters
+from bayesrace.vehicles import Car
 from tests.conftest import Circuit
 from tests.programs import run
 
@@ -23,7 +23,7 @@ CASES = tuple(product(("tracking", "progress"), (0.95, 0.0)))
 
 
 def test_a_step_is_timed_as_it_is_driven_and_solving_it_leaves_no_trace(
-    kinematic_artefact: Path, car: CarParameters, weights: GpWeights, circuit: Circuit
+    kinematic_artefact: Path, car: Car, weights: Weights, circuit: Circuit
 ) -> None:
     """The whole step gives the inputs that lockstep drives with, at its caution; the same to the
     bit where each step is iterated to convergence first."""

@@ -9,7 +9,7 @@ from bayesrace.codegen.ocp import OcpNlp
 from bayesrace.codegen.problems.problem import Problem
 from bayesrace.codegen.settings import BuildSettings
 from bayesrace.controller.native_step import NativeProblem, StepStatus
-from bayesrace.vehicles import CarParameters, default_car
+from bayesrace.vehicles import Car, default_car
 from tests.test_problems import (
     HORIZON,
     IPOPT,
@@ -158,4 +158,4 @@ def test_the_car_states_its_blocks_and_settings_others() -> None:
         data = car.model_dump()
         data["tuning"]["progress"] |= bad
         with pytest.raises(ValidationError, match=next(iter(bad))):
-            CarParameters.model_validate(data)
+            Car.model_validate(data)

@@ -19,12 +19,12 @@ from bayesrace.controller.assembly import PredictiveController
 from bayesrace.controller.driver import Level
 from bayesrace.controller.native_step import NativeStep
 from bayesrace.controller.process_settings import ControllerSettings
-from bayesrace.gp.weights import GpWeights
+from bayesrace.gp.weights import Weights
 from bayesrace.log import LogReader, LogWriter
 from bayesrace.manifest import read_manifest
 from bayesrace.messages import ACTUATION, QUANTITIES, STATE, TELEMETRY, State
 from bayesrace.operation.closed_loop import ClosedLoop
-from bayesrace.vehicles import CarParameters
+from bayesrace.vehicles import Car
 from tests import sample_messages as messages
 from tests.conftest import SETTINGS, Circuit
 from tests.instruments import odometry, reading
@@ -56,8 +56,8 @@ def data(
     tmp_path_factory: pytest.TempPathFactory,
     kinematic_artefact: Path,
     circuit: Circuit,
-    car: CarParameters,
-    weights: GpWeights,
+    car: Car,
+    weights: Weights,
 ) -> Path:
     """Racing line, weights and settings."""
     folder = tmp_path_factory.mktemp("data")
@@ -96,7 +96,7 @@ def test_a_recorded_drive_is_answered_to_the_bit(
     tmp_path: Path,
     native: NativeStep,
     circuit: Circuit,
-    car: CarParameters,
+    car: Car,
 ) -> None:
     log = LogWriter(tmp_path / "log.mcap")
     loop = ClosedLoop(car, circuit.track, circuit.line, PredictiveController(native), log=log)
@@ -114,7 +114,7 @@ def test_a_recorded_drive_is_answered_to_the_bit(
 
 def test_a_drive_by_readings_is_answered_to_the_bit(
     program: Path, data: Path, tmp_path: Path, native: NativeStep, circuit: Circuit,
-    car: CarParameters, weights: GpWeights, kinematic_artefact: Path,
+    car: Car, weights: Weights, kinematic_artefact: Path,
 ) -> None:  # fmt: skip
     log = LogWriter(tmp_path / "log.mcap")
     loop = ClosedLoop(

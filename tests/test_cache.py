@@ -10,13 +10,13 @@ import pytest
 
 from bayesrace.cache import digest, kept
 from bayesrace.errors import InputError
-from bayesrace.gp.weights import GpWeights, read_weights, write_weights
+from bayesrace.gp.weights import Weights, read_weights, write_weights
 from bayesrace.integrators import PREDICTION
 from bayesrace.learning.settings import TrainingSettings
 from bayesrace.operation import preparation
 from bayesrace.raceline import RaceLine, RaceLineSettings, racing_line
 from bayesrace.tracks import load_track
-from bayesrace.vehicles import CarParameters
+from bayesrace.vehicles import Car
 from bayesrace.vehicles.models import dynamic
 from tests.conftest import mirrored_weights, offset_line
 from tests.driven import CAR, drive
@@ -78,7 +78,7 @@ def test_parts_do_not_run_into_each_other() -> None:
 
 
 def test_a_racing_line_is_kept_for_its_track_car_and_settings(
-    tmp_path: Path, car: CarParameters, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, car: Car, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """To the bit, as lockstep runs are compared to the bit."""
     monkeypatch.setenv("BAYESRACE_CACHE", str(tmp_path))
@@ -105,12 +105,12 @@ def test_a_racing_line_is_kept_for_its_track_car_and_settings(
 
 
 def test_weights_are_kept_for_their_samples_settings_and_beginning(
-    tmp_path: Path, weights: GpWeights, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, weights: Weights, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("BAYESRACE_CACHE", str(tmp_path))
     trained: list[object] = []
 
-    def train(*arguments: object) -> GpWeights:
+    def train(*arguments: object) -> Weights:
         trained.append(arguments)
         return replace(weights, version=f"{len(trained)}")
 
@@ -122,7 +122,7 @@ def test_weights_are_kept_for_their_samples_settings_and_beginning(
         arguments: list[Any] = [samples, PREDICTION, settings, None]
         for position, change in zip(changes[::2], changes[1::2], strict=True):
             assert isinstance(position, int)
-            if isinstance(change, GpWeights):
+            if isinstance(change, Weights):
                 write_weights(tmp_path / "first.bin", change)
                 change = tmp_path / "first.bin"
             arguments[position] = change

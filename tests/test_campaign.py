@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 
-from bayesrace.gp.weights import GpWeights, write_weights
+from bayesrace.gp.weights import Weights, write_weights
 from bayesrace.vehicles import default_car, read_car, write_car
 from tests.command_line import Cli, refused
 from tests.programs import Race, campaign_scheduler, finish, peanut, run, start, until
@@ -44,7 +44,7 @@ raceline.margin_m = [0.02, 0.5, 0.6]
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory, weights: GpWeights) -> Path:
+def folder(tmp_path_factory: pytest.TempPathFactory, weights: Weights) -> Path:
     """Plan, track and weights."""
     path = tmp_path_factory.mktemp("campaign")
     peanut(path / "peanut.csv")

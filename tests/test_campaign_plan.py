@@ -10,7 +10,7 @@ import pytest
 from rich.console import Console
 
 from bayesrace.errors import InputError
-from bayesrace.gp.weights import GpWeights, read_weights, write_weights
+from bayesrace.gp.weights import Weights, read_weights, write_weights
 from bayesrace.learning.dataset import Dataset
 from bayesrace.operation.preparation import updated_weights
 from bayesrace.operation.race import race
@@ -18,7 +18,7 @@ from bayesrace.operation.settings import RaceSettings
 from bayesrace.operation.terminal.terminal import stages_on
 from bayesrace.studies.campaign.case import FAILED, Case, factors, run_case
 from bayesrace.studies.campaign.plan import Campaign, read_plan
-from bayesrace.vehicles import CarParameters, write_car
+from bayesrace.vehicles import Car, write_car
 from bayesrace.vehicles.parts import PacejkaTyres
 from tests.programs import peanut
 
@@ -26,7 +26,7 @@ Read = Callable[[str], Campaign]
 
 
 @pytest.fixture
-def read(tmp_path: Path, weights: GpWeights) -> Read:
+def read(tmp_path: Path, weights: Weights) -> Read:
     """Reads a plan that stands beside a track and weights."""
     peanut(tmp_path / "peanut.csv")
     write_weights(tmp_path / "weights.bin", weights)
@@ -102,7 +102,7 @@ def test_controllers_drive_in_the_order_in_which_they_learn(read: Read) -> None:
     assert case.controllers == ("bayesrace", "bayesrace-limit", "bestcase")
 
 
-def test_two_cars_of_one_name_are_refused(read: Read, car: CarParameters, tmp_path: Path) -> None:
+def test_two_cars_of_one_name_are_refused(read: Read, car: Car, tmp_path: Path) -> None:
     write_car(tmp_path / "heavy.toml", car.model_copy(update={"mass_kg": 0.05}))
     with pytest.raises(InputError, match="two cars have the name 'orca'"):
         read("[grid]\ncar = ['orca', 'heavy.toml']")
@@ -141,7 +141,7 @@ def test_draws_stay_what_they_are_when_a_plan_grows(read: Read) -> None:
 
 
 def test_a_key_changes_with_all_that_shapes_a_row(
-    read: Read, tmp_path: Path, weights: GpWeights
+    read: Read, tmp_path: Path, weights: Weights
 ) -> None:
     def key(text: str) -> str:
         (found,) = read(text).cases
@@ -161,7 +161,7 @@ def test_a_key_changes_with_all_that_shapes_a_row(
     assert Case(settings).key == Case(RaceSettings()).key
 
 
-def test_every_factor_does_something(car: CarParameters, tmp_path: Path) -> None:
+def test_every_factor_does_something(car: Car, tmp_path: Path) -> None:
     """What a plan may name reaches the car, the controllers or the training."""
     names = set(factors())
     assert names >= {"delay_s", "sensors"}

@@ -15,7 +15,7 @@ from bayesrace.operation.settings import RaceSettings
 from bayesrace.raceline import RaceLine, compute_raceline
 from bayesrace.tracks import load_track
 from bayesrace.vehicles import (
-    CarParameters,
+    Car,
     Tuning,
     car_text,
     default_car,
@@ -121,9 +121,9 @@ def test_who_simulates_a_car_names_what_its_file_lacks(tmp_path: Path, cli: Cli)
 def test_every_value_of_a_car_has_its_place_in_the_file_and_a_unit() -> None:
     models = [form for one in MODELS.values() for form in one.values()]
     placed = [*MODELS, *(name for names in SECTIONS.values() for name in names)]
-    assert sorted(placed) == sorted(set(CarParameters.model_fields) - {"name", "tuning", "sensors"})
+    assert sorted(placed) == sorted(set(Car.model_fields) - {"name", "tuning", "sensors"})
     forms = [
-        CarParameters,
+        Car,
         Pacejka,
         *models,
         *(field.annotation for field in Tuning.model_fields.values()),

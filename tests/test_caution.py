@@ -14,20 +14,20 @@ from bayesrace.controller.assembly import compiled_controller
 from bayesrace.controller.native_step import NativeStep, StepStatus
 from bayesrace.controller.pure_pursuit import PurePursuitSettings
 from bayesrace.controller.settings import MpcSettings
-from bayesrace.gp.weights import KERNELS, GpWeights, read_weights
+from bayesrace.gp.weights import KERNELS, Weights, read_weights
 from bayesrace.integrators import PREDICTION
 from bayesrace.learning.validation import predictive_sigma
 from bayesrace.operation.closed_loop import ClosedLoop, built_in_car
 from bayesrace.operation.preparation import prepare
 from bayesrace.operation.settings import RaceSettings
 from bayesrace.operation.terminal.terminal import stages_on
-from bayesrace.vehicles import CarParameters, default_car
+from bayesrace.vehicles import Car, default_car
 from bayesrace.vehicles.models import dynamic, e_kinematic
 from bayesrace.vehicles.tuning import CautionTuning
 from tests.conftest import CAUTIOUS, Circuit, Make, discrete, fit_weights, smooth_drive
 
 
-def of_points(weights: GpWeights, count: int) -> GpWeights:
+def of_points(weights: Weights, count: int) -> Weights:
     """The first points of each output."""
     vx, vy, omega = (
         replace(one, inputs=one.inputs[:count], alpha=one.alpha[:count]) for one in weights.outputs
@@ -36,12 +36,12 @@ def of_points(weights: GpWeights, count: int) -> GpWeights:
 
 
 @pytest.fixture
-def unsure(weights: GpWeights) -> GpWeights:
+def unsure(weights: Weights) -> Weights:
     """Of a few points, far from which the posterior knows little."""
     return of_points(weights, 12)
 
 
-def noisy(weights: GpWeights, factor: float) -> GpWeights:
+def noisy(weights: Weights, factor: float) -> Weights:
     """The same mean, with so many times the variance of the noise."""
     outputs = (replace(one, noise_variance=factor * one.noise_variance) for one in weights.outputs)
     vx, vy, omega = outputs
@@ -49,7 +49,7 @@ def noisy(weights: GpWeights, factor: float) -> GpWeights:
 
 
 def driven(
-    step: NativeStep, car: CarParameters, x: Floats, u: Floats, count: int
+    step: NativeStep, car: Car, x: Floats, u: Floats, count: int
 ) -> tuple[Floats, Floats, list[float]]:
     """State and input after so many steps from these, and the pace of each step."""
     plant, paces = discrete(dynamic(car)), []
@@ -64,7 +64,7 @@ def driven(
 @pytest.mark.parametrize("kind", KERNELS)
 @pytest.mark.parametrize("count", [1, 6, 160])
 def test_the_compiled_variance_is_the_posterior_s(
-    make: Make, car: CarParameters, kind: str, count: int
+    make: Make, car: Car, kind: str, count: int
 ) -> None:
     some = of_points(fit_weights(car, (kind, kind, kind)), count)
     step = make(some)
@@ -76,7 +76,7 @@ def test_the_compiled_variance_is_the_posterior_s(
     np.testing.assert_allclose(ours / prior, theirs / prior, rtol=0, atol=1e-9)
 
 
-def test_of_more_points_than_there_is_room_for_some_count(make: Make, car: CarParameters) -> None:
+def test_of_more_points_than_there_is_room_for_some_count(make: Make, car: Car) -> None:
     """The variance is larger than that of all points, and still smaller than the prior's."""
     weights = fit_weights(car, ("rbf", "matern25", "matern15"), count=1024)
     step = make(weights)
@@ -88,7 +88,7 @@ def test_of_more_points_than_there_is_room_for_some_count(make: Make, car: CarPa
     assert np.median(ours / prior) < 0.05
 
 
-def output_effect(car: CarParameters, v: Floats, mean: Floats) -> Floats:
+def output_effect(car: Car, v: Floats, mean: Floats) -> Floats:
     """What the residual does to the states, (7, 3), by CasADi."""
     f = PREDICTION.corrected(e_kinematic(car))
     e = ca.MX.sym("e", 3)
@@ -96,7 +96,7 @@ def output_effect(car: CarParameters, v: Floats, mean: Floats) -> Floats:
     return np.asarray(ca.densify(effect(mean)))
 
 
-def tube_of(step: NativeStep, car: CarParameters, weights: GpWeights, plan: Floats) -> Floats:
+def tube_of(step: NativeStep, car: Car, weights: Weights, plan: Floats) -> Floats:
     """The tube of a plan v = [x; u] (N, 9) by NumPy, along the normals of the last reference.
 
     What the residual's mean may err by counts, and noise, which averages out, does not."""
@@ -128,7 +128,7 @@ def tube_of(step: NativeStep, car: CarParameters, weights: GpWeights, plan: Floa
 
 
 def test_the_tube_adds_correlated_errors_up_along_the_plan(
-    make: Make, car: CarParameters, unsure: GpWeights, circuit: Circuit
+    make: Make, car: Car, unsure: Weights, circuit: Circuit
 ) -> None:
     """Against NumPy: regulator, propagation, and the share of each stage's normal."""
     step = make(unsure, caution=0.95)
@@ -143,7 +143,7 @@ def test_the_tube_adds_correlated_errors_up_along_the_plan(
 
 
 def test_the_car_slows_down_where_it_knows_little_and_speeds_up_again(
-    make: Make, car: CarParameters, weights: GpWeights, circuit: Circuit
+    make: Make, car: Car, weights: Weights, circuit: Circuit
 ) -> None:
     step = make(of_points(weights, 2), caution=0.9999999)
     x, u, paces = driven(step, car, circuit.start(), np.zeros(2), 60)
@@ -161,7 +161,7 @@ def test_the_car_slows_down_where_it_knows_little_and_speeds_up_again(
 
 
 def test_the_reference_does_not_leap_when_nothing_is_uncertain_any_more(
-    make: Make, car: CarParameters, weights: GpWeights, circuit: Circuit
+    make: Make, car: Car, weights: Weights, circuit: Circuit
 ) -> None:
     """As after a rollback to no weights."""
     step = make(noisy(weights, 100), caution=0.95)
@@ -176,7 +176,7 @@ def test_the_reference_does_not_leap_when_nothing_is_uncertain_any_more(
 
 
 def test_the_plan_is_not_pushed_by_its_tube(
-    make: Make, car: CarParameters, unsure: GpWeights, circuit: Circuit
+    make: Make, car: Car, unsure: Weights, circuit: Circuit
 ) -> None:
     """Uncertainty slows the reference down; for the same reference the plan is the same."""
     step = make(unsure, caution=0.95)
@@ -193,7 +193,7 @@ def test_the_plan_is_not_pushed_by_its_tube(
 
 
 def test_the_reference_slows_down_no_faster_than_the_car_can_brake(
-    make: Make, car: CarParameters, weights: GpWeights, circuit: Circuit
+    make: Make, car: Car, weights: Weights, circuit: Circuit
 ) -> None:
     """On half the grip, which the mismatch explains in part only. The rest of what the pace does is
     the line's speed as far as the weights know it, which is hardly less than the line's here."""
@@ -215,7 +215,7 @@ def test_the_reference_slows_down_no_faster_than_the_car_can_brake(
 
 
 def test_a_track_that_is_no_constraint_does_not_slow_the_car_down(
-    make: Make, car: CarParameters, weights: GpWeights, circuit: Circuit
+    make: Make, car: Car, weights: Weights, circuit: Circuit
 ) -> None:
     step = make(noisy(weights, 100), caution=0.95, constraints=False)
     _, _, paces = driven(step, car, circuit.start(), np.zeros(2), 40)
@@ -224,7 +224,7 @@ def test_a_track_that_is_no_constraint_does_not_slow_the_car_down(
 
 
 def test_without_caution_uncertainty_changes_nothing(
-    make: Make, car: CarParameters, unsure: GpWeights, circuit: Circuit
+    make: Make, car: Car, unsure: Weights, circuit: Circuit
 ) -> None:
     """To the bit: the paper's controller, which takes the mean for the truth."""
     steps = [make(one) for one in (unsure, noisy(unsure, 25))]
@@ -245,7 +245,7 @@ def test_a_probability_is_asked_for(value: float) -> None:
 
 
 @pytest.mark.parametrize("change", [{"least": 1.1}, {"share": 1.1}, {"least": 0.0}])
-def test_shares_in_the_tuning_are_shares(car: CarParameters, change: dict[str, float]) -> None:
+def test_shares_in_the_tuning_are_shares(car: Car, change: dict[str, float]) -> None:
     stated = car.tuning.caution.model_dump() | change
     with pytest.raises(ValidationError, match=next(iter(change))):
         CautionTuning.model_validate(stated)

@@ -24,7 +24,7 @@ from bayesrace.recorder import Recorder
 from bayesrace.sensors import get_sensors
 from bayesrace.tracks import load_track
 from bayesrace.transport import Director, Endpoints, Publisher, free_endpoint, open_session
-from bayesrace.vehicles import CarParameters
+from bayesrace.vehicles import Car
 from bayesrace.vehicles.models import dynamic
 from tests.conftest import Circuit
 from tests.network.cars import gentle_course, start_controller, start_plant
@@ -87,7 +87,7 @@ def assert_played_as_driven(log: Path, begin_ns: int) -> None:
     ids=["exact", "instruments and delay"],
 )
 def test_a_run_is_that_of_two_processes_over_zenoh_to_the_bit(
-    tmp_path: Path, car: CarParameters, options: tuple[str, ...], disturbances: dict[str, Any]
+    tmp_path: Path, car: Car, options: tuple[str, ...], disturbances: dict[str, Any]
 ) -> None:
     course, begin_ns = gentle_course(tmp_path, speed_mps=2.5), time.time_ns()
     track, line = load_track(course.track_file, car.width_m), read_raceline(course.line_file)
@@ -146,7 +146,7 @@ class Failing(Simulator):
 
 
 def test_a_fault_of_the_car_ends_the_run(
-    circuit: Circuit, car: CarParameters, kinematic_artefact: Path, tmp_path: Path
+    circuit: Circuit, car: Car, kinematic_artefact: Path, tmp_path: Path
 ) -> None:
     line, vehicle = circuit.line, Failing(dynamic(car))
     law = PurePursuit(car, line.x_m, line.y_m, line.vx_mps)
@@ -162,7 +162,7 @@ def test_a_fault_of_the_car_ends_the_run(
 
 
 def test_without_track_constraints_another_problem_is_solved(
-    circuit: Circuit, car: CarParameters, kinematic_artefact: Path
+    circuit: Circuit, car: Car, kinematic_artefact: Path
 ) -> None:
     def controller(constraints: bool) -> PredictiveController:
         settings = MpcSettings(constraints=constraints)

@@ -47,7 +47,7 @@ from bayesrace.manifest import (
 from bayesrace.messages.types import BRAKING_ROWS, SENSOR_FAULTS
 from bayesrace.operation.cli import export
 from bayesrace.processes import RUN_MODULE
-from bayesrace.vehicles import CarParameters, get_car
+from bayesrace.vehicles import Car, get_car
 from bayesrace.vehicles.models import MODELS
 
 SMALL = BuildSettings(
@@ -102,7 +102,7 @@ def test_the_second_build_comes_from_the_cache(cache: Path) -> None:
     assert contents(cache) == [folder]  # nothing temporary is left
 
 
-def test_the_horizon_is_the_cars_unless_it_is_stated(car: CarParameters) -> None:
+def test_the_horizon_is_the_cars_unless_it_is_stated(car: Car) -> None:
     objective = car.tuning.objective.model_copy(update={"horizon": 12})
     tuning = car.tuning.model_copy(update={"objective": objective})
     short = car.model_copy(update={"tuning": tuning})
@@ -110,7 +110,7 @@ def test_the_horizon_is_the_cars_unless_it_is_stated(car: CarParameters) -> None
     assert BuildSettings(car=short, horizon=10).stages == 10
 
 
-def test_the_artefact_describes_itself(kinematic_artefact: Path, car: CarParameters) -> None:
+def test_the_artefact_describes_itself(kinematic_artefact: Path, car: Car) -> None:
     manifest = read_manifest(kinematic_artefact)
     settings = BuildSettings()
     assert manifest.discretisation == settings.discretisation.identity("e_kinematic", car)
@@ -141,7 +141,7 @@ def test_the_hash_changes_with_every_setting(change: dict[str, object]) -> None:
 
 
 def test_the_hash_changes_with_compiler_flags_casadi_car_and_sources(
-    monkeypatch: pytest.MonkeyPatch, car: CarParameters
+    monkeypatch: pytest.MonkeyPatch, car: Car
 ) -> None:
     compiler, settings = find_compiler(), BuildSettings()
     seen = {build_hash(settings, compiler)}
@@ -169,7 +169,7 @@ def test_the_hash_changes_with_compiler_flags_casadi_car_and_sources(
     [("e_kinematic", PREDICTION), ("dynamic", PERFECT), ("dynamic", PREDICTION)],
 )
 def test_the_chain_rule_gives_the_derivatives_of_the_whole(
-    car: CarParameters, name: str, discretisation: Discretisation
+    car: Car, name: str, discretisation: Discretisation
 ) -> None:
     """(F, J', H) of the stage function against CasADi's own derivatives of corrected(x, u, e)."""
     model = MODELS[name](car)
@@ -280,11 +280,11 @@ def test_a_compiler_that_has_built_a_library_is_not_asked_again(
     assert asked == ["--version"]
 
 
-def load(folder: Path, car: CarParameters) -> NativeStep:
+def load(folder: Path, car: Car) -> NativeStep:
     return NativeStep(folder, car, MpcSettings())
 
 
-def test_a_damaged_library_is_refused(artefact: Path, car: CarParameters) -> None:
+def test_a_damaged_library_is_refused(artefact: Path, car: Car) -> None:
     load(artefact, car)
     data = bytearray((artefact / LIBRARY).read_bytes())
     data[len(data) // 2] ^= 1
@@ -297,7 +297,7 @@ def test_a_damaged_library_is_refused(artefact: Path, car: CarParameters) -> Non
         load(artefact, car)
 
 
-def test_changed_declarations_are_refused(artefact: Path, car: CarParameters) -> None:
+def test_changed_declarations_are_refused(artefact: Path, car: Car) -> None:
     with (artefact / DECLARATIONS).open("a") as file:
         file.write("raise RuntimeError('executed')\n")
     with pytest.raises(InputError, match=rf"{DECLARATIONS} is not the file its manifest describes"):
@@ -316,7 +316,7 @@ def _cut(library: Path) -> None:
     ids=["cut", "missing", "for anybody"],
 )
 def test_an_artefact_that_cannot_be_trusted_is_built_again(
-    cache: Path, car: CarParameters, spoil: Callable[[Path], None]
+    cache: Path, car: Car, spoil: Callable[[Path], None]
 ) -> None:
     folder, _ = build(SMALL)
     left = folder.with_name(f".{folder.name}-killed")
@@ -329,7 +329,7 @@ def test_an_artefact_that_cannot_be_trusted_is_built_again(
 
 @pytest.mark.parametrize("name", [LIBRARY, DECLARATIONS, MANIFEST, "."])
 def test_what_others_may_write_or_own_is_not_loaded(
-    artefact: Path, car: CarParameters, monkeypatch: pytest.MonkeyPatch, name: str
+    artefact: Path, car: Car, monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
     one = artefact / name
     mode = one.stat().st_mode
@@ -351,7 +351,7 @@ __attribute__((constructor)) static void run(void) { FILE *f = fopen("%s", "w");
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root becomes another user")
 def test_code_of_a_user_in_the_group_is_not_executed(
-    artefact: Path, car: CarParameters, tmp_path: Path
+    artefact: Path, car: Car, tmp_path: Path
 ) -> None:
     """The attacker may write library and manifest, as the umask 002 and a shared group allow."""
     ran = tmp_path / "ran"
@@ -377,7 +377,7 @@ def test_code_of_a_user_in_the_group_is_not_executed(
 
 
 def test_what_is_exchanged_after_it_was_checked_is_not_loaded(
-    artefact: Path, car: CarParameters, monkeypatch: pytest.MonkeyPatch
+    artefact: Path, car: Car, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     @contextmanager
     def exchanged(folder: Path, manifest: Manifest) -> Iterator[tuple[bytes, BinaryIO]]:
@@ -397,7 +397,7 @@ def test_what_is_exchanged_after_it_was_checked_is_not_loaded(
 
 @pytest.mark.parametrize("umask", [0, 0o002])
 def test_what_is_built_may_be_loaded_whatever_the_umask(
-    cache: Path, car: CarParameters, tmp_path: Path, umask: int
+    cache: Path, car: Car, tmp_path: Path, umask: int
 ) -> None:
     before = os.umask(umask)
     try:
@@ -447,7 +447,7 @@ def test_the_names_and_numbers_in_python_are_those_of_the_header(kinematic_artef
 
 
 def test_what_is_no_controller_of_this_car_and_release_is_refused(
-    artefact: Path, tmp_path: Path, car: CarParameters
+    artefact: Path, tmp_path: Path, car: Car
 ) -> None:
     with pytest.raises(InputError, match="not a built controller"):
         load(tmp_path, car)
@@ -502,7 +502,7 @@ def test_the_library_cannot_print_exit_or_start_threads(kinematic_artefact: Path
 
 @pytest.mark.check
 def test_ziglang_builds_the_controller_where_there_is_no_compiler(
-    ziglang: None, cache: Path, monkeypatch: pytest.MonkeyPatch, car: CarParameters
+    ziglang: None, cache: Path, monkeypatch: pytest.MonkeyPatch, car: Car
 ) -> None:
     monkeypatch.delenv("CC", raising=False)
     monkeypatch.setattr("bayesrace.codegen.compiler.shutil.which", lambda _: None)

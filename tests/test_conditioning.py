@@ -9,7 +9,7 @@ import pytest
 
 from bayesrace.arrays import Floats
 from bayesrace.gp.expression import evaluate_mean, kernel_matrix
-from bayesrace.gp.weights import GpOutput, GpWeights
+from bayesrace.gp.weights import GpOutput, Weights
 from bayesrace.integrators import PREDICTION
 from bayesrace.learning import conditioning
 from bayesrace.learning.conditioning import conditioned
@@ -20,7 +20,7 @@ from bayesrace.learning.settings import TrainingSettings
 from bayesrace.learning.smoothing import Smoothed, corrected_steps, smooth
 from bayesrace.learning.training import fit
 from bayesrace.learning.validation import predictive_sigma, residual
-from bayesrace.vehicles import CarParameters
+from bayesrace.vehicles import Car
 from tests.conftest import Make, smooth_drive
 from tests.driven import STEP_S
 from tests.racing import prepared, racing
@@ -37,7 +37,7 @@ SHARE = 0.5
 """Of the noise of weights, what is their model's."""
 
 
-def short_drive(make: Make, car: CarParameters) -> tuple[Floats, Floats, Drive]:
+def short_drive(make: Make, car: Car) -> tuple[Floats, Floats, Drive]:
     """Poses within periods, and a gyro at their ends; one of the poses is nowhere near."""
     random, step = np.random.default_rng(2), make()
     _, u = smooth_drive(car, 14, 2)
@@ -52,7 +52,7 @@ def short_drive(make: Make, car: CarParameters) -> tuple[Floats, Floats, Drive]:
 
 
 def dense(
-    weights: GpWeights, made: GpWeights, samples: Dataset, drive: Drive, z: Floats, images: bool
+    weights: Weights, made: Weights, samples: Dataset, drive: Drive, z: Floats, images: bool
 ) -> tuple[Floats, Floats]:
     """Means and variances (n, 3) of the correction at ``z`` (n, 6): the joint Gaussian of it, the
     start and all noise, conditioned on all readings and samples at once. In the :data:`UNKNOWN`
@@ -162,8 +162,8 @@ def prior(
 @pytest.mark.parametrize("mirrored", [True, False])
 def test_it_is_what_all_readings_and_samples_at_once_say(
     make: Make,
-    car: CarParameters,
-    weights: GpWeights,
+    car: Car,
+    weights: Weights,
     mirrored: bool,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -197,7 +197,7 @@ def test_it_is_what_all_readings_and_samples_at_once_say(
     np.testing.assert_allclose(stated.mean(axis=0), variance.mean(axis=0), rtol=0.01)
 
 
-def two_drives(make: Make, car: CarParameters, weights: GpWeights) -> list[Dataset]:
+def two_drives(make: Make, car: Car, weights: Weights) -> list[Dataset]:
     """Smoothed, as samples."""
     found = []
     for begin in (0, 7):
@@ -211,9 +211,7 @@ def two_drives(make: Make, car: CarParameters, weights: GpWeights) -> list[Datas
     return [smoothed_again(one, PREDICTION, weights) for one in found]
 
 
-def test_the_order_of_drives_does_not_matter(
-    make: Make, car: CarParameters, weights: GpWeights
-) -> None:
+def test_the_order_of_drives_does_not_matter(make: Make, car: Car, weights: Weights) -> None:
     drives = two_drives(make, car, weights)
     z = np.vstack([one.features for one in drives])
     there, back, first = (
@@ -225,7 +223,7 @@ def test_the_order_of_drives_does_not_matter(
 
 
 def test_samples_of_a_drive_that_the_model_cannot_follow_stay_as_they_are(
-    make: Make, car: CarParameters, weights: GpWeights, monkeypatch: pytest.MonkeyPatch
+    make: Make, car: Car, weights: Weights, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     first, second = two_drives(make, car, weights)
     both = concatenate([first, second])
@@ -241,7 +239,7 @@ def test_samples_of_a_drive_that_the_model_cannot_follow_stay_as_they_are(
     np.testing.assert_array_equal(found.deviation[len(first) :], second.deviation)
 
 
-def latent(weights: GpWeights, z: Floats) -> Floats:
+def latent(weights: Weights, z: Floats) -> Floats:
     """Variances (n, 3) of the corrections, without noise."""
     noise = [one.noise_variance * one.y_scale**2 for one in weights.outputs]
     return np.asarray(predictive_sigma(weights, z) ** 2 - noise)

@@ -20,7 +20,7 @@ from bayesrace.raceline import RaceLine, RaceLineSettings, read_raceline
 from bayesrace.raceline.friction import timed_line
 from bayesrace.tracks import Track, load_track, write_track
 from bayesrace.tracks.spline import fit_arc_length
-from bayesrace.vehicles import CarParameters, get_car
+from bayesrace.vehicles import Car, get_car
 from tests.conftest import offset_line
 
 
@@ -79,7 +79,7 @@ def test_the_report_shows_where_the_line_asks_for_what_was_not_driven(on: Prepar
 
 
 def test_the_smallest_larger_copy_that_has_what_is_missing_is_chosen(
-    on: PreparedTrack, car: CarParameters, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    on: PreparedTrack, car: Car, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setenv("BAYESRACE_CACHE", str(tmp_path / "cache"))
     settings, here, sizes = RaceLineSettings(), driving(on.line), list[float]()
@@ -105,7 +105,7 @@ def test_the_smallest_larger_copy_that_has_what_is_missing_is_chosen(
     assert larger_course(on, 1.0, never, car, settings) is None  # no copy is so fast
 
 
-def larger_line(on: PreparedTrack, size: float, car: CarParameters) -> RaceLine:
+def larger_line(on: PreparedTrack, size: float, car: Car) -> RaceLine:
     """The line on a copy of that size, as fast as the car can."""
     path = fit_arc_length(size * on.line.xy_m)
     return timed_line("larger", path, car, RaceLineSettings())

@@ -9,12 +9,12 @@ import pytest
 from bayesrace.controller.assembly import compiled_controller
 from bayesrace.controller.process_settings import ControllerSettings
 from bayesrace.controller.settings import CompensationSettings, MpcSettings
-from bayesrace.gp.weights import GpWeights
+from bayesrace.gp.weights import Weights
 from bayesrace.messages import RunRequest
 from bayesrace.operation.closed_loop import ClosedLoop, Driven
 from bayesrace.plant.car import CarRun
 from bayesrace.plant.simulator import Simulator
-from bayesrace.vehicles import CarParameters
+from bayesrace.vehicles import Car
 from bayesrace.vehicles.models import dynamic
 from tests.conftest import Circuit
 from tests.driven import blank
@@ -23,9 +23,7 @@ START = (0.0, 0.0, 0.3, 1.0, 0.0, 0.0, 0.05)
 
 
 @pytest.mark.parametrize("delay_ms", [3, 20, 47])
-def test_an_input_acts_after_its_delay_and_the_state_reports_it(
-    car: CarParameters, delay_ms: int
-) -> None:
+def test_an_input_acts_after_its_delay_and_the_state_reports_it(car: Car, delay_ms: int) -> None:
     """Against the same inputs, each held from its own moment on, a millisecond at a time."""
     inputs = [(0.4, 0.5), (0.9, -1.0), (0.2, 2.0), (0.6, 0.0), (0.3, -0.5), (0.5, 0.1)]
     request = blank(
@@ -49,7 +47,7 @@ def test_an_input_acts_after_its_delay_and_the_state_reports_it(
 
 
 def test_a_delay_is_measured_and_compensated_in_lockstep_too(
-    circuit: Circuit, car: CarParameters, kinematic_artefact: Path, weights: GpWeights
+    circuit: Circuit, car: Car, kinematic_artefact: Path, weights: Weights
 ) -> None:
     """20 ms each way: nearly the lap without a delay; uncompensated far from it."""
 

@@ -17,7 +17,7 @@ from bayesrace.controller.estimator import Belief, Measurement
 from bayesrace.controller.native_step import NativeStep
 from bayesrace.errors import InputError
 from bayesrace.gp.expression import mean_function
-from bayesrace.gp.weights import GpWeights
+from bayesrace.gp.weights import Weights
 from bayesrace.integrators import PREDICTION
 from bayesrace.operation.closed_loop import ClosedLoop
 from bayesrace.operation.settings import PreparationSettings
@@ -25,7 +25,7 @@ from bayesrace.operation.training_drives import drive_for_training
 from bayesrace.raceline import compute_raceline
 from bayesrace.sensors import Sensors, get_sensors
 from bayesrace.tracks import load_track
-from bayesrace.vehicles import CarParameters, get_car
+from bayesrace.vehicles import Car, get_car
 from bayesrace.vehicles.models import e_kinematic
 from tests.conftest import SETTINGS, Make, smooth_drive
 from tests.estimator import Estimator
@@ -189,7 +189,7 @@ class Drive:
 
 
 @pytest.fixture
-def drive(car: CarParameters, make: Make) -> Drive:
+def drive(car: Car, make: Make) -> Drive:
     """Pose at 50 Hz, gyro and wheel speed at 200 Hz, steering encoder at 30 Hz, all noisy; by the
     corrected model itself."""
     random, step = np.random.default_rng(3), make()
@@ -276,7 +276,7 @@ def estimator(step: NativeStep, gate: float = 0.0, acceleration: Floats = MODEL)
 
 
 def test_the_transition_is_the_prediction_with_its_derivatives(
-    make: Make, car: CarParameters, weights: GpWeights
+    make: Make, car: Car, weights: Weights
 ) -> None:
     step, e = make(), PREDICTION.corrected(e_kinematic(car))
     mu = mean_function(weights)
@@ -422,7 +422,7 @@ def test_what_cannot_be_is_refused_and_counted(make: Make, drive: Drive) -> None
 
 
 def test_it_begins_with_a_pose_from_standstill_and_not_before(
-    kinematic_artefact: Path, car: CarParameters
+    kinematic_artefact: Path, car: Car
 ) -> None:
     made, x = estimator(NativeStep(kinematic_artefact, car, SETTINGS)), np.array([0.5, 0.2, 1.0])
     gyro = Measurement(TS, GYRO, (5,), (0.0,), (0.02,))
@@ -439,7 +439,7 @@ def test_it_begins_with_a_pose_from_standstill_and_not_before(
 
 
 def test_steering_stays_what_it_was_where_it_begins_anew_without_the_model(
-    kinematic_artefact: Path, car: CarParameters
+    kinematic_artefact: Path, car: Car
 ) -> None:
     """Little says where the wheels are; the first of two poses is an outlier."""
     step = NativeStep(kinematic_artefact, car, SETTINGS)

@@ -14,7 +14,7 @@ from bayesrace.codegen.settings import BuildSettings
 from bayesrace.controller.assembly import compiled_controller
 from bayesrace.controller.pure_pursuit import PurePursuit
 from bayesrace.controller.python_controller import PythonController
-from bayesrace.gp.weights import GpWeights, read_weights
+from bayesrace.gp.weights import Weights, read_weights
 from bayesrace.integrators import PREDICTION
 from bayesrace.learning.settings import TrainingSettings
 from bayesrace.learning.training import train
@@ -109,7 +109,7 @@ def test_a_lap_that_was_learned_from_pure_pursuit_stays_on_the_small_track(tmp_p
 
 
 @pytest.fixture(scope="module")
-def first_weights() -> GpWeights:
+def first_weights() -> Weights:
     """Those that a race on the small track begins with, of a seed whose GP errs at low speed."""
     with stages_on(Console(quiet=True)) as stages:
         return read_weights(prepare(PreparationSettings(car=CAR, seed=1), (), stages).weights)
@@ -117,7 +117,7 @@ def first_weights() -> GpWeights:
 
 @pytest.mark.parametrize(("what", "found"), [("as learned", ""), ("flip omega", "back at 1")])
 def test_first_weights_outlast_a_standing_start_if_they_are_good(
-    first_weights: GpWeights, what: str, found: str
+    first_weights: Weights, what: str, found: str
 ) -> None:
     """Sent before the car has driven. From a standing start the nominal model errs less than they
     do, until the car corners: too few samples to roll good weights back. Spoilt ones are."""

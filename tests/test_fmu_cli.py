@@ -6,7 +6,7 @@ import pytest
 from fmpy import read_model_description
 from fmpy.validation import validate_fmu
 
-from bayesrace.gp.weights import GpWeights, write_weights
+from bayesrace.gp.weights import Weights, write_weights
 from bayesrace.raceline.line import write_raceline
 from bayesrace.tracks import write_track
 from tests.command_line import Cli, refused
@@ -22,7 +22,7 @@ def test_the_car_is_exported(cli: Cli, tmp_path: Path) -> None:
 
 
 def test_the_controller_of_a_track_is_exported_and_given_other_weights(
-    cli: Cli, tmp_path: Path, circuit: Circuit, weights: GpWeights
+    cli: Cli, tmp_path: Path, circuit: Circuit, weights: Weights
 ) -> None:
     names = ("track.csv", "line.csv", "weights.bin", "controller.fmu", "other.fmu")
     track, line, learned, out, other = (tmp_path / name for name in names)

@@ -15,7 +15,7 @@ from bayesrace.codegen.host_files import PATH_FILE, WEIGHTS_FILE, path_file, wei
 from bayesrace.controller import assembly, driver, native_step
 from bayesrace.controller.native_step import StepStatus
 from bayesrace.errors import InputError
-from bayesrace.gp.weights import GpWeights
+from bayesrace.gp.weights import Weights
 from bayesrace.manifest import read_manifest
 from tests.conftest import Circuit
 from tests.fmu_lockstep import Exported, exported_controllers  # noqa: F401 - a fixture
@@ -56,7 +56,7 @@ def loader(tmp_path_factory: pytest.TempPathFactory, kinematic_artefact: Path) -
 
 
 @pytest.fixture(scope="module")
-def good(circuit: Circuit, weights: GpWeights) -> tuple[bytes, bytes]:
+def good(circuit: Circuit, weights: Weights) -> tuple[bytes, bytes]:
     """Both files, small."""
     rows = circuit.table.rows[::16]
     identity = weights.discretisation
@@ -117,7 +117,7 @@ def hostile(data: bytes, random: np.random.Generator) -> list[bytes]:
 
 
 def test_files_are_loaded_or_refused_and_never_read_beyond_their_end(
-    loader: Path, tmp_path: Path, good: tuple[bytes, bytes], weights: GpWeights
+    loader: Path, tmp_path: Path, good: tuple[bytes, bytes], weights: Weights
 ) -> None:
     random = np.random.default_rng(0)
     path, gp = good
@@ -154,7 +154,7 @@ def test_missing_files_and_weights_of_another_model_are_named(
 
 
 def test_what_cannot_be_loaded_is_not_written(
-    circuit: Circuit, weights: GpWeights, kinematic_artefact: Path
+    circuit: Circuit, weights: Weights, kinematic_artefact: Path
 ) -> None:
     identity = read_manifest(kinematic_artefact).discretisation
     with pytest.raises(InputError, match="learned for"):

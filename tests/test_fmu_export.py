@@ -23,7 +23,7 @@ from bayesrace.codegen.fmu.archive import licence_files, third_parties
 from bayesrace.codegen.fmu.build import get_platform
 from bayesrace.errors import InputError
 from bayesrace.plant.vehicle import PlantGuard
-from bayesrace.vehicles import CarParameters, get_car
+from bayesrace.vehicles import Car, get_car
 from bayesrace.vehicles.models import STATES
 from tests.car_fmu import Kind, Version, built_in, commands, driven, packed_car, slave, unpacked_car
 from tests.cars import with_numbers
@@ -68,12 +68,12 @@ def test_the_archive_has_what_people_look_for(version: Version, kind: Kind) -> N
         assert variable.attrib["name"] == "time" or variable.attrib["description"]
 
 
-def test_the_same_export_is_the_same_file(tmp_path: Path, car: CarParameters) -> None:
+def test_the_same_export_is_the_same_file(tmp_path: Path, car: Car) -> None:
     again = pack(car_fmu(car, 3, "cs"), tmp_path / "again.fmu")
     assert again.read_bytes() == packed_car(3).read_bytes()
 
 
-def test_another_car_has_another_token(car: CarParameters) -> None:
+def test_another_car_has_another_token(car: Car) -> None:
     tokens = set()
     for fmu in (packed_car(2), packed_car(3), packed_car(3, "me")):
         text = zipfile.ZipFile(fmu).read("modelDescription.xml").decode()
@@ -82,7 +82,7 @@ def test_another_car_has_another_token(car: CarParameters) -> None:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_both_versions_drive_like_the_built_in_plant(car: CarParameters, seed: int) -> None:
+def test_both_versions_drive_like_the_built_in_plant(car: Car, seed: int) -> None:
     """Design: same trajectory as the built-in plant to 1e-9; FMI 2.0 and 3.0 to the last bit."""
     inputs = commands(600, seed)
     expected = built_in(car, inputs)
@@ -99,7 +99,7 @@ def test_both_versions_drive_like_the_built_in_plant(car: CarParameters, seed: i
 
 
 @pytest.mark.parametrize("h", [0.002, 0.005, 0.01, 0.1, 0.5])
-def test_any_communication_step_is_a_period_of_that_length(car: CarParameters, h: float) -> None:
+def test_any_communication_step_is_a_period_of_that_length(car: Car, h: float) -> None:
     inputs = commands(100, 7)
     one = slave()
     one.initialise(START)
@@ -165,7 +165,7 @@ def test_the_guard_in_c_is_the_plants(
 
 
 @pytest.mark.parametrize("name", sorted(ORCA.equation_numbers | ORCA.guard_numbers))
-def test_every_parameter_acts_as_in_a_car_with_it(car: CarParameters, name: str) -> None:
+def test_every_parameter_acts_as_in_a_car_with_it(car: Car, name: str) -> None:
     inputs = [(1.3, 8.0)] * 5 + commands(150, 3)  # first beyond the limits
     value = (car.equation_numbers | car.guard_numbers)[name] * 1.25
     one = slave()
@@ -234,12 +234,12 @@ def test_a_step_that_ends_at_infinity_is_undone_and_said() -> None:
     one.close()
 
 
-def test_model_exchange_in_fmi_2_is_refused(car: CarParameters) -> None:
+def test_model_exchange_in_fmi_2_is_refused(car: Car) -> None:
     with pytest.raises(InputError, match="--version 3"):
         car_fmu(car, 2, "me")
 
 
-def test_a_definition_that_cannot_work_is_refused(car: CarParameters, tmp_path: Path) -> None:
+def test_a_definition_that_cannot_work_is_refused(car: Car, tmp_path: Path) -> None:
     definition = car_fmu(car)
     with pytest.raises(InputError, match="unknown platform 'amiga'"):
         pack(definition, tmp_path / "x.fmu", ["amiga"])

@@ -13,7 +13,7 @@ from fmpy import instantiate_fmu, read_model_description, simulate_fmu
 
 from bayesrace.arrays import Floats
 from bayesrace.plant.simulator import Simulator
-from bayesrace.vehicles import CarParameters, default_car
+from bayesrace.vehicles import Car, default_car
 from bayesrace.vehicles.models import (
     INPUTS,
     STATES,
@@ -72,7 +72,7 @@ def points(count: int, seed: int = 0) -> list[tuple[Floats, Floats]]:
     return [(row[:7], row[7:]) for row in rows]
 
 
-def jacobian(car: CarParameters) -> Any:
+def jacobian(car: Car) -> Any:
     """(x, u) -> d xdot / d KNOWN of the symbolic equations at this car's parameters."""
     ode = dynamic_with_parameters(car)
     x, u, p = ca.SX.sym("x", 7), ca.SX.sym("u", 2), ca.SX.sym("p", len(car.equation_numbers))
@@ -82,7 +82,7 @@ def jacobian(car: CarParameters) -> Any:
     return lambda a, b: np.asarray(function(a, b, values))
 
 
-def test_derivatives_are_the_dynamic_models(instance: Instance, car: CarParameters) -> None:
+def test_derivatives_are_the_dynamic_models(instance: Instance, car: Car) -> None:
     ode = dynamic(car).ode
     for x, u in points(200):
         instance.put(x, u)
@@ -90,7 +90,7 @@ def test_derivatives_are_the_dynamic_models(instance: Instance, car: CarParamete
         np.testing.assert_allclose(instance.rates(), expected, rtol=1e-12, atol=1e-10)
 
 
-def test_directional_derivatives_are_exact(instance: Instance, car: CarParameters) -> None:
+def test_directional_derivatives_are_exact(instance: Instance, car: Car) -> None:
     exact = jacobian(car)
     random = np.random.default_rng(1)
     for x, u in points(60, 1):
@@ -109,9 +109,7 @@ def test_a_state_is_an_output_whose_derivative_is_one(instance: Instance) -> Non
 
 
 @pytest.mark.parametrize(("d", "rate"), [(0.6, 0.3), (0.3, -0.2)])
-def test_a_solver_of_variable_step_drives_like_the_plant(
-    car: CarParameters, d: float, rate: float
-) -> None:
+def test_a_solver_of_variable_step_drives_like_the_plant(car: Car, d: float, rate: float) -> None:
     start = {"x": 1.0, "psi": 0.3, "vx": 1.0, "d": d, "delta_rate": rate}
     result = simulate_fmu(
         str(packed_car(3, "me")),

@@ -11,7 +11,7 @@ from fmpy.fmi1 import FMICallException
 
 from bayesrace.codegen.fmu import car_fmu
 from bayesrace.codegen.fmu.build import sources_of, write_sources
-from bayesrace.vehicles import CarParameters
+from bayesrace.vehicles import Car
 from tests.car_fmu import Kind, Version, commands, driven, slave
 from tests.fmu_master import Slave
 from tests.native_programs import PROGRAMS, SANITIZERS, gcc
@@ -153,9 +153,7 @@ def test_values_are_set_all_or_none(version: Version) -> None:
 
 @pytest.mark.check
 @pytest.mark.parametrize(("version", "kind"), [(2, "cs"), (3, "cs"), (3, "me")])
-def test_misuse_under_sanitizers(
-    version: Version, kind: Kind, car: CarParameters, tmp_path: Path
-) -> None:
+def test_misuse_under_sanitizers(version: Version, kind: Kind, car: Car, tmp_path: Path) -> None:
     """tests/native/fmi_misuse.c: NULL, wrong sizes, wrong phases, damaged bytes, stale states."""
     sources = write_sources(sources_of(car_fmu(car, version, kind))[1], tmp_path)
     program = PROGRAMS / "fmi_misuse.c"

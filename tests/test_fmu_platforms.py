@@ -18,7 +18,7 @@ from bayesrace.codegen.compiler import find_compiler
 from bayesrace.codegen.fmu import car_fmu, pack
 from bayesrace.codegen.fmu.build import FLAGS, get_platform, host_platform
 from bayesrace.errors import InputError
-from bayesrace.vehicles import CarParameters
+from bayesrace.vehicles import Car
 from tests.car_fmu import Version, built_in, commands, driven, packed_car, slave, unpacked_car
 from tests.fmu_master import Slave
 
@@ -64,7 +64,7 @@ def test_the_sources_rebuild_the_binary_with_the_line_they_state(
 
 
 def test_another_platform_needs_ziglang(
-    car: CarParameters, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    car: Car, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("bayesrace.codegen.fmu.build.find_spec", lambda name: None)
     host = host_platform().name
@@ -155,7 +155,7 @@ def drive_program(platform: str, sources: Path, program: Path) -> None:
 @pytest.mark.parametrize("everywhere", [3], indirect=True)
 @pytest.mark.parametrize("platform", ["aarch64-linux", WINDOWS])
 def test_on_other_platforms_the_same_binary_drives_alike(
-    platform: str, everywhere: Path, car: CarParameters, tmp_path: Path
+    platform: str, everywhere: Path, car: Car, tmp_path: Path
 ) -> None:
     """But for the C library, whose sine may differ in its last bit."""
     if host_platform().name != "x86_64-linux":

@@ -8,7 +8,7 @@ from sklearn.gaussian_process import GaussianProcessRegressor
 from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
 from bayesrace.gp.expression import evaluate_mean, kernel, kernel_matrix, mean_function
-from bayesrace.gp.weights import KERNELS, GpOutput, GpWeights, zero_weights
+from bayesrace.gp.weights import KERNELS, GpOutput, Weights, zero_weights
 from tests.scikit import correlation, scikit_gp
 
 LENGTHS = np.array([1.0, 0.7, 3.0, 0.4, 1.5, 5.0])
@@ -34,9 +34,9 @@ def fitted(kind: str, count: int = 40, seed: int = 0) -> tuple[GaussianProcessRe
     )
 
 
-def weights_of(kinds: tuple[str, ...], count: int = 40) -> GpWeights:
+def weights_of(kinds: tuple[str, ...], count: int = 40) -> Weights:
     vx, vy, omega = (fitted(kind, count + i, i)[1] for i, kind in enumerate(kinds))
-    return GpWeights(version="v", car="orca", discretisation="d", outputs=(vx, vy, omega))
+    return Weights(version="v", car="orca", discretisation="d", outputs=(vx, vy, omega))
 
 
 def points(count: int = 20, seed: int = 9) -> Floats:
@@ -47,7 +47,7 @@ def points(count: int = 20, seed: int = 9) -> Floats:
 def test_mean_equals_scikit_learn(kind: str) -> None:
     gp, output = fitted(kind)
     outputs = (output, output, output)
-    weights = GpWeights(version="v", car="orca", discretisation="d", outputs=outputs)
+    weights = Weights(version="v", car="orca", discretisation="d", outputs=outputs)
     z = np.vstack((points(), output.inputs))
     expected = Y_MEAN + Y_SCALE * gp.predict(z)
     assert np.abs(evaluate_mean(weights, z) - expected[:, None]).max() < 1e-10

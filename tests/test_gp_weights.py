@@ -18,7 +18,7 @@ from bayesrace.gp import weights as module
 from bayesrace.gp.weights import (
     KERNELS,
     GpOutput,
-    GpWeights,
+    Weights,
     decode_weights,
     encode_weights,
     read_weights,
@@ -45,10 +45,10 @@ def make_output(seed: int = 0, count: int = 5, kernel: str = "rbf", **changes: A
     return GpOutput(**(values | changes))
 
 
-def make_weights(count: int = 5, kernels: tuple[str, ...] = KERNELS[:3]) -> GpWeights:
+def make_weights(count: int = 5, kernels: tuple[str, ...] = KERNELS[:3]) -> Weights:
     vx, vy, omega = (make_output(i, count + i, kernel) for i, kernel in enumerate(kernels))
     metrics = {"vx": {"rmse": 0.1}, "training vx": {"points": 5.0}}
-    return GpWeights(
+    return Weights(
         version="v1",
         car="orca",
         discretisation="model/rk4",

@@ -12,7 +12,7 @@ from bayesrace.learning.sources import recorded_car
 from bayesrace.operation.closed_loop import built_in_car
 from bayesrace.operation.settings import RaceSettings
 from bayesrace.sensors import EXACT, Sensors
-from bayesrace.vehicles import CarParameters, get_car, read_car, write_car
+from bayesrace.vehicles import Car, get_car, read_car, write_car
 from bayesrace.vehicles.parts import DcMotor
 from tests.cars import with_numbers
 from tests.command_line import Cli, refused
@@ -25,13 +25,13 @@ GUESS = {"cm1": 0.4, "cm2": 0.03, "cr0": 0.02, "cr2": 0.001, "friction": 0.5}
 CR2 = get_car("orca").drive.numbers()["cr2"]
 
 
-def guess(car: CarParameters) -> CarParameters:
+def guess(car: Car) -> Car:
     """The car of a driver who has measured size and mass, and guesses the rest."""
     numbers = GUESS if isinstance(car.drive, DcMotor) else {"friction": 0.4}
     return with_numbers(car, numbers).model_copy(update={"tyres": None, "inertia_kgm2": None})
 
 
-def found_in(*logs: Path, car: CarParameters | None = None) -> Identified:
+def found_in(*logs: Path, car: Car | None = None) -> Identified:
     begun, drivers = recorded_car(logs, car, "")
     return identify(begun, read_drives(drivers))
 
@@ -48,7 +48,7 @@ def near(found: Identified, name: str, true: float, share: float = 0.03) -> None
 
 
 @functools.cache
-def skid_pad(car: CarParameters) -> float:
+def skid_pad(car: Car) -> float:
     """Largest lateral acceleration of a car like the orca over g on slowly rising throttle, the
     steering held at 70 % of its range."""
     pad, delta, best = built_in_car(car), 0.7 * car.delta_max_rad, 0.0

@@ -7,7 +7,7 @@ from scipy.integrate import solve_ivp
 
 from bayesrace.arrays import Floats
 from bayesrace.integrators import PERFECT, PREDICTION, SCHEMES, Discretisation
-from bayesrace.vehicles import CarParameters
+from bayesrace.vehicles import Car
 from bayesrace.vehicles.models import MODELS, Model, dynamic, e_kinematic
 from tests.cars import with_numbers
 
@@ -33,7 +33,7 @@ def one(discretisation: Discretisation, model: Model) -> Floats:
 @pytest.mark.parametrize("name", ["dynamic", "e_kinematic"])
 @pytest.mark.parametrize("scheme", sorted(SCHEMES))
 def test_the_order_measured_by_halving_is_the_order_claimed(
-    car: CarParameters, scheme: str, name: str
+    car: Car, scheme: str, name: str
 ) -> None:
     model, (order, _) = MODELS[name](car), SCHEMES[scheme]
     truth = exact(model, X, U, 0.2)
@@ -47,7 +47,7 @@ def test_the_order_measured_by_halving_is_the_order_claimed(
 
 
 @pytest.mark.parametrize("scheme", sorted(SCHEMES))
-def test_substeps_are_the_same_as_shorter_steps(car: CarParameters, scheme: str) -> None:
+def test_substeps_are_the_same_as_shorter_steps(car: Car, scheme: str) -> None:
     model = dynamic(car)
     short = Discretisation(scheme=scheme, step_s=0.005).discretise(model)
     x = X
@@ -58,7 +58,7 @@ def test_substeps_are_the_same_as_shorter_steps(car: CarParameters, scheme: str)
 
 
 def test_the_perfect_discretisation_is_stable_and_accurate_from_standstill(
-    car: CarParameters,
+    car: Car,
 ) -> None:
     """Tyre forces are stiff at low speed: too few sub-steps oscillate."""
     model = dynamic(car)
@@ -80,7 +80,7 @@ def exact_pose(start: Floats, end: Floats, time_s: float) -> Floats:
     return np.asarray(solution.y[:, -1])
 
 
-def test_the_interpolated_pose_follows_the_corrected_velocities(car: CarParameters) -> None:
+def test_the_interpolated_pose_follows_the_corrected_velocities(car: Car) -> None:
     """Heading exactly; position with an error that falls by 2^5 when the step is halved."""
     model, errors = e_kinematic(car), []
     correction = np.array([0.05, -0.04, 0.6])
@@ -96,7 +96,7 @@ def test_the_interpolated_pose_follows_the_corrected_velocities(car: CarParamete
 
 
 def test_the_correction_reaches_the_velocities_and_the_pose_only_if_interpolated(
-    car: CarParameters,
+    car: Car,
 ) -> None:
     correction = np.array([0.01, 0.02, 0.3])
     for pose in ("integrated", "interpolated"):
@@ -122,9 +122,7 @@ def test_the_correction_reaches_the_velocities_and_the_pose_only_if_interpolated
         {"pose": "integrated"},
     ],
 )
-def test_identity_changes_with_the_discretisation(
-    car: CarParameters, other: dict[str, object]
-) -> None:
+def test_identity_changes_with_the_discretisation(car: Car, other: dict[str, object]) -> None:
     changed = PREDICTION.model_copy(update=other)
     ours = PREDICTION.identity("e_kinematic", car)
     assert changed.identity("e_kinematic", car) != ours
@@ -134,13 +132,13 @@ def test_identity_changes_with_the_discretisation(
 @pytest.mark.parametrize(
     "field", ["lf_m", "lr_m", "mass_kg", "inertia_kgm2", "cm1", "cm2", "cr0", "front_b"]
 )
-def test_identity_changes_with_the_car(car: CarParameters, field: str) -> None:
+def test_identity_changes_with_the_car(car: Car, field: str) -> None:
     changed = with_numbers(car, {field: 1.01 * car.equation_numbers[field]})
     assert PREDICTION.identity("dynamic", changed) != PREDICTION.identity("dynamic", car)
 
 
 @pytest.mark.parametrize("field", ["friction", "width_m", "length_m"])
-def test_identity_ignores_friction_and_outline(car: CarParameters, field: str) -> None:
+def test_identity_ignores_friction_and_outline(car: Car, field: str) -> None:
     changed = car.model_copy(update={field: 1.5 * getattr(car, field)})
     assert changed.model_copy(update={"name": "x"}).digest() == car.digest()
     assert PREDICTION.identity("dynamic", changed) == PREDICTION.identity("dynamic", car)

@@ -21,7 +21,7 @@ from rich.console import Console
 
 from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
-from bayesrace.gp.weights import GpWeights, decode_weights, write_weights, zero_weights
+from bayesrace.gp.weights import Weights, decode_weights, write_weights, zero_weights
 from bayesrace.integrators import PERFECT, PREDICTION
 from bayesrace.learning.dataset import Dataset, concatenate
 from bayesrace.learning.sources import write_npz
@@ -223,14 +223,14 @@ def test_an_interruption_while_an_answer_is_missing_loses_no_samples(
 # What is given at the start ------------------------------------------------------------------
 
 
-def given(folder: Path, weights: GpWeights) -> Path:
+def given(folder: Path, weights: Weights) -> Path:
     write_weights(folder / "given.bin", weights)
     return folder / "given.bin"
 
 
 @pytest.mark.parametrize("known", [True, False], ids=["of these samples", "of others"])
 def test_what_is_given_at_the_start_is_given_once(
-    tmp_path: Path, jobs: Jobs, known: bool, learned: GpWeights
+    tmp_path: Path, jobs: Jobs, known: bool, learned: Weights
 ) -> None:
     """What the weights know counts as samples, unless they were learned from these very ones.
 
@@ -253,7 +253,7 @@ def test_what_is_given_at_the_start_is_given_once(
 
 
 @pytest.fixture(scope="module")
-def learned() -> GpWeights:
+def learned() -> Weights:
     """Weights that know something at a few points."""
     weights = zero_weights(CAR.name, NAME, "given")
     known = replace(weights.outputs[0], inputs=FIRST.features[:5], alpha=np.ones(5))

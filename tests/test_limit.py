@@ -21,7 +21,7 @@ from bayesrace.limit import (
 from bayesrace.operation.settings import RaceSettings
 from bayesrace.plant.simulator import Simulator, plant_discretisation
 from bayesrace.tracks import StartLine
-from bayesrace.vehicles import CarParameters, get_car
+from bayesrace.vehicles import Car, get_car
 from bayesrace.vehicles.models import command_limits, dynamic, top_command
 from tests.command_line import Cli, refused
 from tests.test_raceline import circle, track_called
@@ -29,7 +29,7 @@ from tests.test_raceline import circle, track_called
 CAR = get_car("orca")
 
 
-def limit_on(name: str, car: CarParameters = CAR, **options: float) -> LimitLap:
+def limit_on(name: str, car: Car = CAR, **options: float) -> LimitLap:
     return limit_lap(track_called(name), car, LimitSettings.model_validate(options))
 
 
@@ -58,7 +58,7 @@ def test_on_a_circle_it_is_the_fastest_steady_drive_along_the_inner_edge(radius:
     np.testing.assert_allclose(np.hypot(lap.x[:, 0], lap.x[:, 1]), radius, atol=1e-5)
 
 
-def driven_by_the_plant(lap: LimitLap, car: CarParameters, piece_s: float) -> tuple[Floats, float]:
+def driven_by_the_plant(lap: LimitLap, car: Car, piece_s: float) -> tuple[Floats, float]:
     """What the plant makes of the inputs at 1 kHz, beginning anew after each piece: positions (n,
     2), and the largest error of the states at the ends of the pieces, over their sizes."""
     simulator = Simulator(dynamic(car), plant_discretisation(1000))

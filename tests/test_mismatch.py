@@ -17,7 +17,7 @@ from bayesrace.controller.native_step import NativeStep
 from bayesrace.controller.process_settings import ControllerSettings
 from bayesrace.controller.settings import MpcSettings
 from bayesrace.errors import InputError
-from bayesrace.gp.weights import GpWeights
+from bayesrace.gp.weights import Weights
 from bayesrace.integrators import PREDICTION
 from bayesrace.learning.validation import predictive_sigma
 from bayesrace.operation.closed_loop import ClosedLoop, built_in_car
@@ -26,7 +26,7 @@ from bayesrace.operation.settings import PreparationSettings
 from bayesrace.operation.terminal.terminal import stages_on
 from bayesrace.plant.simulator import Simulator
 from bayesrace.sensors import Sensors, get_sensors
-from bayesrace.vehicles import CarParameters
+from bayesrace.vehicles import Car
 from bayesrace.vehicles.models import e_kinematic
 from bayesrace.vehicles.parts import DcMotor
 from tests.conftest import CAUTIOUS, Circuit, Make
@@ -88,7 +88,7 @@ def of_state(x: Floats, u: Floats) -> Floats:
     return np.array([-0.05 * u[0], 0.02 * x[5], -0.3 * x[5]])
 
 
-def terms_of(plain: NativeStep, car: CarParameters, x: Floats, u: Floats) -> Floats:
+def terms_of(plain: NativeStep, car: Car, x: Floats, u: Floats) -> Floats:
     """[1; features; changes by the model] in their units, (10,)."""
     problem = tracking(e_kinematic(car), PREDICTION)
     deviation = np.array([one.deviation for one in problem.states])
@@ -143,7 +143,7 @@ def regressed(phi: Floats, y: Floats, r: Floats, odd: bool) -> tuple[Floats, Var
 
 
 def test_the_error_is_the_regression_of_what_was_observed(
-    make: Make, step: NativeStep, weights: GpWeights, car: CarParameters, circuit: Circuit
+    make: Make, step: NativeStep, weights: Weights, car: Car, circuit: Circuit
 ) -> None:
     """Against NumPy, from all errors at each step, older ones with larger variances: what the model
     is corrected by, and what widens the band of a plan."""
@@ -203,7 +203,7 @@ def averaged(measurements: list[tuple[Floats, Floats, Floats]], odd: bool) -> Fl
 
 @pytest.mark.parametrize("size", [1e-4, 1e-3], ids=["noise", "a mismatch"])
 def test_what_measurements_say_is_averaged_with_no_mismatch(
-    make: Make, step: NativeStep, car: CarParameters, circuit: Circuit, size: float
+    make: Make, step: NativeStep, car: Car, circuit: Circuit, size: float
 ) -> None:
     """Against NumPy, from all measurements at each step."""
     plain, random, ffi = make(), np.random.default_rng(4), step.artefact.ffi
@@ -256,7 +256,7 @@ def test_derivatives_are_those_of_what_is_predicted(
 
 
 def test_a_model_that_is_right_stays_as_it_is(
-    make: Make, step: NativeStep, weights: GpWeights, circuit: Circuit
+    make: Make, step: NativeStep, weights: Weights, circuit: Circuit
 ) -> None:
     """A car that is as noisy as its weights say: less than a fifth of that is corrected."""
     plain, rng = make(), np.random.default_rng(0)
@@ -278,7 +278,7 @@ def test_what_the_regression_does_not_explain_widens_the_band(
     assert seen.widening[-1] > 5
 
 
-def test_the_preparation_changes_nothing(make: Make, car: CarParameters, circuit: Circuit) -> None:
+def test_the_preparation_changes_nothing(make: Make, car: Car, circuit: Circuit) -> None:
     """Also if parameters are set between it and the step."""
     ends = []
     for prepared in (False, True):
@@ -291,7 +291,7 @@ def test_the_preparation_changes_nothing(make: Make, car: CarParameters, circuit
 
 
 def test_other_weights_and_a_new_run_begin_without_mismatch(
-    make: Make, step: NativeStep, weights: GpWeights, circuit: Circuit
+    make: Make, step: NativeStep, weights: Weights, circuit: Circuit
 ) -> None:
     plain, x, u = make(), circuit.start(), np.array([0.3, 0.1])
     vx, vy, omega = weights.outputs
@@ -309,7 +309,7 @@ def test_other_weights_and_a_new_run_begin_without_mismatch(
 
 
 def test_weights_that_are_in_use_already_change_nothing(
-    make: Make, step: NativeStep, weights: GpWeights, circuit: Circuit
+    make: Make, step: NativeStep, weights: Weights, circuit: Circuit
 ) -> None:
     plain, x, u = make(), circuit.start(), np.array([0.3, 0.1])
     drive(step, plain, circuit, of_state, 15)
@@ -320,7 +320,7 @@ def test_weights_that_are_in_use_already_change_nothing(
 
 
 def test_switched_off_and_on_caution_begins_anew(
-    make: Make, step: NativeStep, car: CarParameters, circuit: Circuit
+    make: Make, step: NativeStep, car: Car, circuit: Circuit
 ) -> None:
     plain = make()
     x, u = drive(step, plain, circuit, of_state, 15).states[-1], np.zeros(2)
@@ -391,7 +391,7 @@ def test_one_wrong_measurement_does_not_count_for_long(
 )
 def test_the_cycle_shows_states_in_a_row_of_a_car_that_moves(
     step: NativeStep,
-    car: CarParameters,
+    car: Car,
     circuit: Circuit,
     numbers: range,
     vx_mps: float,

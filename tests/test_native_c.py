@@ -9,8 +9,8 @@ import pytest
 
 from bayesrace.arrays import Floats
 from bayesrace.controller.native_step import NativeStep
-from bayesrace.gp.weights import GpWeights, zero_weights
-from bayesrace.vehicles import CarParameters
+from bayesrace.gp.weights import Weights, zero_weights
+from bayesrace.vehicles import Car
 from tests.conftest import SETTINGS, Circuit, Problem, native_numbers
 from tests.native_programs import (
     OPTIMISED,
@@ -42,8 +42,8 @@ def problems(
     tmp_path_factory: pytest.TempPathFactory,
     recorded: list[Problem],
     circuit: Circuit,
-    weights: GpWeights,
-    car: CarParameters,
+    weights: Weights,
+    car: Car,
 ) -> Path:
     """The harness' input file."""
     table = circuit.table
@@ -70,8 +70,8 @@ def test_the_control_loop_never_allocates_and_python_sees_the_same_bits(
     kinematic_artefact: Path,
     problems: Path,
     tmp_path: Path,
-    car: CarParameters,
-    weights: GpWeights,
+    car: Car,
+    weights: Weights,
     circuit: Circuit,
     recorded: list[Problem],
 ) -> None:
@@ -107,8 +107,8 @@ def test_no_sanitizer_finds_anything(
     artefact: str,
     problems: Path,
     tmp_path: Path,
-    car: CarParameters,
-    weights: GpWeights,
+    car: Car,
+    weights: Weights,
     request: pytest.FixtureRequest,
 ) -> None:
     folder: Path = request.getfixturevalue(artefact)

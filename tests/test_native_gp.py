@@ -12,9 +12,9 @@ from bayesrace.controller.native_step import NativeStep
 from bayesrace.controller.settings import MpcSettings
 from bayesrace.errors import InputError
 from bayesrace.gp.expression import corrected_function
-from bayesrace.gp.weights import KERNELS, GpWeights, zero_weights
+from bayesrace.gp.weights import KERNELS, Weights, zero_weights
 from bayesrace.integrators import PERFECT, PREDICTION
-from bayesrace.vehicles import CarParameters
+from bayesrace.vehicles import Car
 from bayesrace.vehicles.models import dynamic, e_kinematic
 from tests.conftest import LENGTH_SCALES, fit_weights, smooth_drive
 from tests.scikit import scikit_gp
@@ -22,7 +22,7 @@ from tests.scikit import scikit_gp
 NOMINAL = np.array([0.3, -0.2, 0.5, 1.8, 0.05, 0.8, 0.08, 0.5, 0.5])
 
 
-def points(car: CarParameters, count: int = 30, seed: int = 5) -> Floats:
+def points(car: Car, count: int = 30, seed: int = 5) -> Floats:
     """v = [x; u] of a drive that the weights have not seen."""
     states, inputs = smooth_drive(car, count, seed)
     return np.column_stack([states, inputs])
@@ -50,7 +50,7 @@ def check(step: NativeStep, function: ca.Function, vs: Floats, hessian: bool = T
             np.testing.assert_allclose(a, b, rtol=0, atol=1e-12 * max(1.0, np.abs(b).max()))
 
 
-def loaded(artefact: Path, car: CarParameters, weights: GpWeights | None = None) -> NativeStep:
+def loaded(artefact: Path, car: Car, weights: Weights | None = None) -> NativeStep:
     step = NativeStep(artefact, car, MpcSettings())
     if weights is not None:
         step.set_weights(weights)
@@ -59,7 +59,7 @@ def loaded(artefact: Path, car: CarParameters, weights: GpWeights | None = None)
 
 @pytest.mark.parametrize("best_case", [False, True])
 def test_the_nominal_stage_equals_casadi(
-    kinematic_artefact: Path, dynamic_artefact: Path, car: CarParameters, best_case: bool
+    kinematic_artefact: Path, dynamic_artefact: Path, car: Car, best_case: bool
 ) -> None:
     """Also at standstill, where the dynamic model's tyre forces are blended."""
     slow = points(car, 4)
@@ -71,9 +71,7 @@ def test_the_nominal_stage_equals_casadi(
         check(loaded(kinematic_artefact, car), PREDICTION.discretise(e_kinematic(car)), vs)
 
 
-def test_three_kernels_of_three_sizes_equal_casadi(
-    kinematic_artefact: Path, car: CarParameters
-) -> None:
+def test_three_kernels_of_three_sizes_equal_casadi(kinematic_artefact: Path, car: Car) -> None:
     """Sizes that leave every remainder in the vector lanes, none, and the whole capacity."""
     sizes = [(1, 2, 3), (7, 8, 9), (15, 16, 17), (0, 5, 160), (33, 0, 0), (1024, 1024, 1024)]
     full = fit_weights(car, ("matern15", "rbf", "matern25"), count=1024)
@@ -87,7 +85,7 @@ def test_three_kernels_of_three_sizes_equal_casadi(
         check(step, corrected_function(e_kinematic(car), PREDICTION, weights), points(car, 6))
 
 
-def test_a_bare_offset_is_a_correction(kinematic_artefact: Path, car: CarParameters) -> None:
+def test_a_bare_offset_is_a_correction(kinematic_artefact: Path, car: Car) -> None:
     nothing = zero_weights(car.name, PREDICTION.identity("e_kinematic", car))
     vx, vy, omega = nothing.outputs
     weights = replace(nothing, outputs=(vx, vy, replace(omega, y_mean=0.25)))
@@ -96,7 +94,7 @@ def test_a_bare_offset_is_a_correction(kinematic_artefact: Path, car: CarParamet
 
 
 def test_zero_weights_are_the_nominal_model_to_the_bit(
-    kinematic_artefact: Path, car: CarParameters, weights: GpWeights
+    kinematic_artefact: Path, car: Car, weights: Weights
 ) -> None:
     fresh, used = loaded(kinematic_artefact, car), loaded(kinematic_artefact, car, weights)
     costate = np.ones(7)
@@ -108,7 +106,7 @@ def test_zero_weights_are_the_nominal_model_to_the_bit(
 
 @pytest.mark.parametrize("kind", KERNELS)
 def test_the_compiled_mean_equals_scikit_learn(
-    kinematic_artefact: Path, car: CarParameters, weights: GpWeights, kind: str
+    kinematic_artefact: Path, car: Car, weights: Weights, kind: str
 ) -> None:
     source = weights.outputs[2]
     theta = np.log([1.5, *LENGTH_SCALES, 0.05])
@@ -127,7 +125,7 @@ def test_the_compiled_mean_equals_scikit_learn(
 
 @pytest.mark.parametrize("kind", KERNELS)
 def test_at_a_training_point_and_far_away_everything_is_finite(
-    kinematic_artefact: Path, car: CarParameters, kind: str
+    kinematic_artefact: Path, car: Car, kind: str
 ) -> None:
     weights = fit_weights(car, (kind, kind, kind), count=40)
     step = loaded(kinematic_artefact, car, weights)
@@ -145,7 +143,7 @@ def answers(step: NativeStep) -> bytes:
     return b"".join(part.tobytes() for part in step.evaluate(NOMINAL, np.ones(7)))
 
 
-def refused(step: NativeStep, weights: GpWeights, words: str) -> None:
+def refused(step: NativeStep, weights: Weights, words: str) -> None:
     before = answers(step)
     with pytest.raises(InputError, match=words):
         step.set_weights(weights)
@@ -153,7 +151,7 @@ def refused(step: NativeStep, weights: GpWeights, words: str) -> None:
 
 
 def test_weights_for_another_discretisation_are_refused(
-    native: NativeStep, weights: GpWeights, car: CarParameters
+    native: NativeStep, weights: Weights, car: Car
 ) -> None:
     euler = PREDICTION.model_copy(update={"scheme": "euler"})
     other = replace(weights, discretisation=euler.identity("e_kinematic", car))
@@ -163,7 +161,7 @@ def test_weights_for_another_discretisation_are_refused(
     refused(native, other, "were learned for")
 
 
-def test_more_points_than_the_capacity_are_refused(native: NativeStep, weights: GpWeights) -> None:
+def test_more_points_than_the_capacity_are_refused(native: NativeStep, weights: Weights) -> None:
     vx, vy, omega = weights.outputs
     big = replace(vy, inputs=np.zeros((1025, 6)), alpha=np.zeros(1025))
     refused(native, replace(weights, outputs=(vx, big, omega)), "1025 points")

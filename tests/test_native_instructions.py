@@ -13,7 +13,7 @@ from bayesrace.gp.expression import corrected_function
 from bayesrace.gp.weights import KERNELS
 from bayesrace.integrators import PREDICTION
 from bayesrace.learning.validation import predictive_sigma
-from bayesrace.vehicles import CarParameters
+from bayesrace.vehicles import Car
 from bayesrace.vehicles.models import e_kinematic
 from tests.conftest import Make, Problem, fit_weights
 from tests.test_native_gp import check, points
@@ -44,7 +44,7 @@ def test_the_best_that_there_is_is_used_at_first(make: Make) -> None:
 @pytest.mark.parametrize("kind", KERNELS)
 @pytest.mark.parametrize("name", NAMES)
 def test_model_and_variance_are_those_of_the_oracles(
-    kinematic_artefact: Path, car: CarParameters, kind: str, name: str
+    kinematic_artefact: Path, car: Car, kind: str, name: str
 ) -> None:
     """But for the second derivative of Matern 1/2, which the compiled Hessian leaves out."""
     weights = fit_weights(car, (kind, kind, kind), count=131)

@@ -11,7 +11,7 @@ from bayesrace.controller.assembly import PathTable, make_path_table
 from bayesrace.controller.native_step import NativeStep
 from bayesrace.controller.settings import MpcSettings
 from bayesrace.errors import InputError
-from bayesrace.vehicles import CarParameters, default_car
+from bayesrace.vehicles import Car, default_car
 from tests.conftest import Circuit
 
 TS, HORIZON = 0.02, 20
@@ -50,7 +50,7 @@ def references(table: PathTable, s: float) -> Floats:
 
 
 @pytest.fixture
-def step(kinematic_artefact: Path, car: CarParameters, circuit: Circuit) -> NativeStep:
+def step(kinematic_artefact: Path, car: Car, circuit: Circuit) -> NativeStep:
     """A controller of which only the planner is looked at."""
     step = NativeStep(kinematic_artefact, car, MpcSettings(iterations=1, iterations_cold=1))
     step.set_path(circuit.table)

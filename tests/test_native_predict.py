@@ -13,9 +13,9 @@ from bayesrace.codegen.problems.driving import advance_function, linearise_funct
 from bayesrace.controller.native_step import NativeStep
 from bayesrace.errors import InputError
 from bayesrace.gp.expression import mean_function
-from bayesrace.gp.weights import GpWeights
+from bayesrace.gp.weights import Weights
 from bayesrace.integrators import PERFECT, PREDICTION, Discretisation
-from bayesrace.vehicles import CarParameters
+from bayesrace.vehicles import Car
 from bayesrace.vehicles.models import MODELS, Model, dynamic, e_kinematic
 from tests.conftest import SETTINGS, Make, Problem, smooth_drive
 
@@ -24,7 +24,7 @@ NONE = np.zeros(7)
 
 
 @pytest.fixture
-def nominal(kinematic_artefact: Path, car: CarParameters) -> NativeStep:
+def nominal(kinematic_artefact: Path, car: Car) -> NativeStep:
     """Without correction, and without a path, which predictions do not need."""
     return NativeStep(kinematic_artefact, car, SETTINGS)
 
@@ -34,7 +34,7 @@ def corrected(make: Make) -> NativeStep:
     return make()
 
 
-def drives(car: CarParameters, count: int = 40) -> list[tuple[Floats, Floats]]:
+def drives(car: Car, count: int = 40) -> list[tuple[Floats, Floats]]:
     """States and inputs away from the steering angle's limit."""
     states, inputs = smooth_drive(car, count, 5)
     pairs = zip(states, inputs, strict=True)
@@ -53,7 +53,7 @@ def integrated(model: Model, x: Floats, u: Floats, duration_s: float) -> Floats:
 
 @pytest.mark.parametrize("duration_s", [0.0005, 0.002, 0.0137, 0.02, 0.035, 0.1])
 def test_without_weights_it_integrates_the_model(
-    nominal: NativeStep, car: CarParameters, duration_s: float
+    nominal: NativeStep, car: Car, duration_s: float
 ) -> None:
     for x, u in drives(car)[::5]:
         if abs(x[6] + duration_s * u[1]) > car.delta_max_rad:
@@ -65,7 +65,7 @@ def test_without_weights_it_integrates_the_model(
         assert error[:3].max() < 1e-9 + 60 * min(duration_s, TS) ** 2 * duration_s
 
 
-def test_part_of_a_stage_has_the_schemes_order(nominal: NativeStep, car: CarParameters) -> None:
+def test_part_of_a_stage_has_the_schemes_order(nominal: NativeStep, car: Car) -> None:
     """One step of RK4 with the pose by Simpson's rule: the error falls at least as h^3."""
     model, ratios = e_kinematic(car), []
     for x, u in drives(car)[::5]:
@@ -77,7 +77,7 @@ def test_part_of_a_stage_has_the_schemes_order(nominal: NativeStep, car: CarPara
     assert np.median(ratios) > 7
 
 
-def test_the_best_case_predicts_the_car(dynamic_artefact: Path, car: CarParameters) -> None:
+def test_the_best_case_predicts_the_car(dynamic_artefact: Path, car: Car) -> None:
     step = NativeStep(dynamic_artefact, car, SETTINGS)
     model = dynamic(car)
     for x, u in drives(car)[::5]:
@@ -91,9 +91,7 @@ def test_the_best_case_predicts_the_car(dynamic_artefact: Path, car: CarParamete
             np.testing.assert_allclose(predicted, expected, rtol=0, atol=2e-3)
 
 
-def test_whole_stages_are_the_controllers_own_map(
-    corrected: NativeStep, car: CarParameters
-) -> None:
+def test_whole_stages_are_the_controllers_own_map(corrected: NativeStep, car: Car) -> None:
     for x, u in drives(car):
         expected = x
         for stages in (1, 2, 3):
@@ -113,7 +111,7 @@ def test_whole_stages_are_the_controllers_own_map(
     ],
 )
 def test_over_a_whole_stage_the_part_is_the_stage(
-    car: CarParameters, name: str, discretisation: Discretisation
+    car: Car, name: str, discretisation: Discretisation
 ) -> None:
     """To the last bits: operations are the same, but may be in another order."""
     model = MODELS[name](car)
@@ -126,7 +124,7 @@ def test_over_a_whole_stage_the_part_is_the_stage(
 
 
 def test_part_of_a_stage_takes_its_share_of_the_residual(
-    corrected: NativeStep, car: CarParameters, weights: GpWeights
+    corrected: NativeStep, car: Car, weights: Weights
 ) -> None:
     """Against the CasADi expressions of the model and of the posterior mean."""
     over, mean = PREDICTION.over(e_kinematic(car)), mean_function(weights)
@@ -138,7 +136,7 @@ def test_part_of_a_stage_takes_its_share_of_the_residual(
             np.testing.assert_allclose(predicted, expected, rtol=0, atol=1e-12)
 
 
-def test_angle_and_inputs_stop_at_their_limits(corrected: NativeStep, car: CarParameters) -> None:
+def test_angle_and_inputs_stop_at_their_limits(corrected: NativeStep, car: Car) -> None:
     x = np.array([0.0, 0, 0, 1.5, 0, 0, car.delta_max_rad - 0.01])
     for duration_s in (0.005, TS, 0.07):
         after = corrected.predict(x, np.array([0.5, 4.0]), duration_s)
@@ -154,7 +152,7 @@ def test_angle_and_inputs_stop_at_their_limits(corrected: NativeStep, car: CarPa
 
 
 def test_impossible_durations_and_what_is_not_finite_are_refused(
-    corrected: NativeStep, weights: GpWeights, car: CarParameters
+    corrected: NativeStep, weights: Weights, car: Car
 ) -> None:
     x, u = drives(car)[0]
     assert corrected.predict(x, u, 0.0).tobytes() == x.tobytes()
@@ -175,7 +173,7 @@ def test_impossible_durations_and_what_is_not_finite_are_refused(
 
 
 def test_predicting_leaves_the_controller_as_it_is(
-    corrected: NativeStep, nominal: NativeStep, recorded: list[Problem], weights: GpWeights
+    corrected: NativeStep, nominal: NativeStep, recorded: list[Problem], weights: Weights
 ) -> None:
     nominal.set_weights(weights)
     for p in recorded[:30]:

@@ -9,7 +9,7 @@ import pytest
 from bayesrace.arrays import Floats
 from bayesrace.controller.native_step import NativeStep
 from bayesrace.controller.settings import MpcSettings
-from bayesrace.vehicles import CarParameters
+from bayesrace.vehicles import Car
 from tests.conftest import SETTINGS, Circuit, Make, Problem
 from tests.test_native_time import TS, Clock, residual, solve
 
@@ -70,7 +70,7 @@ def test_preparing_again_counts_from_the_last_step(make: Make, recorded: list[Pr
             prepared.prepare(expected)
 
 
-Between = Callable[[NativeStep, Circuit, CarParameters], object]
+Between = Callable[[NativeStep, Circuit, Car], object]
 
 
 def changed(**changes: float) -> Between:
@@ -94,7 +94,7 @@ BETWEEN: dict[str, Between] = {
 
 @pytest.mark.parametrize("what", BETWEEN)
 def test_what_happens_in_between_is_seen(
-    make: Make, recorded: list[Problem], circuit: Circuit, car: CarParameters, what: str
+    make: Make, recorded: list[Problem], circuit: Circuit, car: Car, what: str
 ) -> None:
     prepared, plain = make(), make()
     for k, p in enumerate(recorded[:24]):

@@ -13,8 +13,8 @@ import pytest
 from bayesrace.arrays import Floats
 from bayesrace.controller.native_step import NativeStep
 from bayesrace.errors import InputError
-from bayesrace.gp.weights import GpWeights, pack_weights
-from bayesrace.vehicles import CarParameters
+from bayesrace.gp.weights import Weights, pack_weights
+from bayesrace.vehicles import Car
 from tests.conftest import Make, Problem, fit_weights, mirrored_weights
 from tests.native_programs import OPTIMISED, PROGRAMS, native_program
 
@@ -58,14 +58,14 @@ def drive(native: NativeStep, recorded: list[Problem], takeovers: Mapping[int, b
 
 
 def test_taking_over_the_same_weights_changes_no_bit(
-    make: Make, weights: GpWeights, recorded: list[Problem]
+    make: Make, weights: Weights, recorded: list[Problem]
 ) -> None:
     busy = drive(make(), recorded, dict.fromkeys(range(0, 100, 7), pack_weights(weights)))
     assert busy.tobytes() == drive(make(), recorded, {}).tobytes()
 
 
 def test_adopted_weights_are_those_that_were_staged(
-    make: Make, weights: GpWeights, recorded: list[Problem]
+    make: Make, weights: Weights, recorded: list[Problem]
 ) -> None:
     """Packed as another process sends them: to the same bits as set directly."""
     other = mirrored_weights(weights)
@@ -74,7 +74,7 @@ def test_adopted_weights_are_those_that_were_staged(
 
 
 def test_staging_changes_nothing_before_the_adoption(
-    native: NativeStep, weights: GpWeights, recorded: list[Problem]
+    native: NativeStep, weights: Weights, recorded: list[Problem]
 ) -> None:
     x, u = recorded[50].x0, np.array([0.5, 0.1])
     before = native.predict(x, u, 0.02)
@@ -87,7 +87,7 @@ def test_staging_changes_nothing_before_the_adoption(
         native.adopt_weights()
 
 
-def test_unusable_weights_are_not_staged(native: NativeStep, weights: GpWeights) -> None:
+def test_unusable_weights_are_not_staged(native: NativeStep, weights: Weights) -> None:
     packed = pack_weights(weights)
     scale = struct.pack("<d", weights.outputs[0].amplitudes[1])
     with pytest.raises(InputError, match="unusable"):
@@ -99,7 +99,7 @@ def test_unusable_weights_are_not_staged(native: NativeStep, weights: GpWeights)
 
 
 def test_inputs_jump_only_as_far_as_the_new_model_explains(
-    make: Make, car: CarParameters, recorded: list[Problem]
+    make: Make, car: Car, recorded: list[Problem]
 ) -> None:
     """The very next input is what a controller would give that had the new weights all along."""
     other = fit_weights(car, ("matern25", "matern25", "matern25"), seed=4)

@@ -8,8 +8,8 @@ import pytest
 
 from bayesrace.controller.native_step import NativeStep, StepStatus
 from bayesrace.errors import InputError
-from bayesrace.gp.weights import GpWeights
-from bayesrace.vehicles import CarParameters
+from bayesrace.gp.weights import Weights
+from bayesrace.vehicles import Car
 from tests.conftest import SETTINGS, Circuit, Make, Problem
 
 
@@ -58,7 +58,7 @@ def test_a_failed_step_says_why_keeps_the_input_and_leaves_no_trace(
 
 
 def test_a_steering_angle_that_the_rate_can_bring_back_is_solved(
-    native: NativeStep, recorded: list[Problem], car: CarParameters
+    native: NativeStep, recorded: list[Problem], car: Car
 ) -> None:
     p = recorded[0]
     for side in (1, -1):
@@ -78,7 +78,7 @@ def test_a_plan_off_the_dynamics_is_a_defect(make: Make, recorded: list[Problem]
 
 
 def test_weights_that_overflow_are_not_finite_and_others_recover(
-    native: NativeStep, weights: GpWeights, recorded: list[Problem]
+    native: NativeStep, weights: Weights, recorded: list[Problem]
 ) -> None:
     vx, vy, omega = weights.outputs
     huge = replace(vy, alpha=np.full(vy.count, 1e306), signal_variance=1e3)
@@ -90,7 +90,7 @@ def test_weights_that_overflow_are_not_finite_and_others_recover(
 
 
 def test_a_step_without_a_path_and_a_wrong_reference_are_input_errors(
-    kinematic_artefact: Path, car: CarParameters
+    kinematic_artefact: Path, car: Car
 ) -> None:
     step = NativeStep(kinematic_artefact, car, SETTINGS)
     with pytest.raises(InputError, match="have not been set"):

@@ -16,9 +16,9 @@ from bayesrace.controller.assembly import make_path_table
 from bayesrace.controller.native_step import NativeStep, StepStatus
 from bayesrace.controller.settings import MpcSettings
 from bayesrace.gp.expression import corrected_function
-from bayesrace.gp.weights import GpWeights
+from bayesrace.gp.weights import Weights
 from bayesrace.integrators import PERFECT, PREDICTION
-from bayesrace.vehicles import CarParameters, default_car
+from bayesrace.vehicles import Car, default_car
 from bayesrace.vehicles.models import dynamic, e_kinematic
 from tests.conftest import (
     MIRROR_INPUT,
@@ -64,11 +64,11 @@ def exact(make: Make) -> NativeStep:
 
 
 @pytest.fixture(scope="module")
-def corrected(car: CarParameters, weights: GpWeights) -> ca.Function:
+def corrected(car: Car, weights: Weights) -> ca.Function:
     return corrected_function(e_kinematic(car), PREDICTION, weights)
 
 
-def active(problem: Problem, x: Floats, u: Floats, car: CarParameters) -> dict[str, bool]:
+def active(problem: Problem, x: Floats, u: Floats, car: Car) -> dict[str, bool]:
     """Which kinds of limit bind in a plan."""
     ref = problem.reference
     along = np.sum(ref[:, 2:4] * x[1:, :2], axis=1)
@@ -81,7 +81,7 @@ def active(problem: Problem, x: Floats, u: Floats, car: CarParameters) -> dict[s
 
 
 def test_the_converged_step_is_the_solution_of_ipopt(
-    exact: NativeStep, corrected: ca.Function, recorded: list[Problem], car: CarParameters
+    exact: NativeStep, corrected: ca.Function, recorded: list[Problem], car: Car
 ) -> None:
     ocp = OcpNlp(problem_of(E_KINEMATIC), corrected, 20, options=TIGHT_IPOPT | FROM_OUR_PLAN)
     kinds: dict[str, int] = {}
@@ -112,7 +112,7 @@ def test_nearly_every_problem_converges_from_cold(
 
 @pytest.mark.check
 def test_the_cost_is_no_worse_than_that_of_ipopt_from_its_own_start(
-    exact: NativeStep, corrected: ca.Function, recorded: list[Problem], car: CarParameters
+    exact: NativeStep, corrected: ca.Function, recorded: list[Problem], car: Car
 ) -> None:
     options = TIGHT_IPOPT | {"max_iter": 300}
     ocp = OcpNlp(problem_of(E_KINEMATIC), corrected, 20, options=options)
@@ -130,7 +130,7 @@ def test_the_cost_is_no_worse_than_that_of_ipopt_from_its_own_start(
 
 
 def test_the_converged_best_case_step_is_the_solution_of_ipopt(
-    dynamic_artefact: Path, car: CarParameters, circuit: Circuit
+    dynamic_artefact: Path, car: Car, circuit: Circuit
 ) -> None:
     """The dynamic model with ten sub-steps, whose derivatives are composed by the chain rule."""
     step = NativeStep(dynamic_artefact, car, SETTINGS)
@@ -170,7 +170,7 @@ def stationarity_at_least(
     u: Floats,
     f: ca.Function,
     settings: MpcSettings,
-    car: CarParameters,
+    car: Car,
 ) -> float:
     """Norm of the Lagrangian's gradient in the inputs for the *best* multipliers.
 
@@ -210,7 +210,7 @@ def stationarity_at_least(
 
 
 def check_residuals(
-    step: NativeStep, problem: Problem, f: ca.Function, s: MpcSettings, car: CarParameters
+    step: NativeStep, problem: Problem, f: ca.Function, s: MpcSettings, car: Car
 ) -> float:
     """Asserts that info describes the plan; returns the independent stationarity."""
     x, u, info = step.plan_x, step.plan_u, step.info
@@ -233,7 +233,7 @@ def check_residuals(
 
 
 def test_residuals_of_converged_plans_are_true(
-    exact: NativeStep, corrected: ca.Function, recorded: list[Problem], car: CarParameters
+    exact: NativeStep, corrected: ca.Function, recorded: list[Problem], car: Car
 ) -> None:
     for problem in recorded[3::25]:
         assert solved(exact, problem)[0] is StepStatus.CONVERGED
@@ -242,7 +242,7 @@ def test_residuals_of_converged_plans_are_true(
 
 
 def test_residuals_of_real_time_steps_are_true(
-    native: NativeStep, corrected: ca.Function, recorded: list[Problem], car: CarParameters
+    native: NativeStep, corrected: ca.Function, recorded: list[Problem], car: Car
 ) -> None:
     """One iteration a step: not stationary, and the step says so, never less than the truth."""
     native.reset()
@@ -288,7 +288,7 @@ def test_a_setting_moves_the_tracks_edges(
 
 
 def test_a_mirrored_track_gives_mirrored_laps(
-    make: Make, native: NativeStep, weights: GpWeights, circuit: Circuit
+    make: Make, native: NativeStep, weights: Weights, circuit: Circuit
 ) -> None:
     track, line = circuit.track.mirrored(), mirrored_line(circuit.line)
     mirror = Circuit(track, line, make_path_table(track, line, default_car().tuning.path.spacing_m))

@@ -22,7 +22,7 @@ from bayesrace.studies.paper.experiment import Experiment, Finding, at_most
 from bayesrace.studies.paper.loop import line_section, published_line, tenth_section
 from bayesrace.studies.paper.models import gains, kernel_section, model_section, smoothness
 from bayesrace.studies.settings import DRIVES, PaperSettings
-from bayesrace.vehicles import CarParameters, builtin_cars, get_car, parameters
+from bayesrace.vehicles import Car, builtin_cars, get_car, parameters
 from bayesrace.vehicles.models import dynamic
 from bayesrace.vehicles.tuning import PursuitTuning
 from tests.command_line import Cli, refused
@@ -147,7 +147,7 @@ def test_a_cars_tuning_may_change_and_what_is_published_stays(
         PursuitTuning.model_fields["slower"], "json_schema_extra", {"reference": 0.9}
     )
     cars = {
-        name: CarParameters.model_validate(one.model_dump(exclude={"tuning"}))
+        name: Car.model_validate(one.model_dump(exclude={"tuning"}))
         for name, one in builtin_cars().items()
     }
     monkeypatch.setattr(parameters, "builtin_cars", lambda: cars)

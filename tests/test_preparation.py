@@ -11,7 +11,7 @@ import pytest
 from rich.console import Console
 
 from bayesrace.errors import InputError
-from bayesrace.gp.weights import GpWeights, read_weights
+from bayesrace.gp.weights import Weights, read_weights
 from bayesrace.learning.dataset import Dataset, concatenate
 from bayesrace.manifest import LIBRARY
 from bayesrace.operation.closed_loop import Watch
@@ -33,7 +33,7 @@ Preparing = Callable[..., tuple[Prepared, list[str]]]
 def preparing(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
-    weights: GpWeights,
+    weights: Weights,
     kinematic_artefact: Path,
 ) -> Preparing:
     """Prepares in an empty cache, with these changes; what the console shows. A line and weights
@@ -131,11 +131,11 @@ def test_the_training_drive_is_kept_for_all_that_shapes_it(preparing: Preparing)
 
 
 def test_the_controller_learns_from_its_own_laps_of_the_training_track(
-    preparing: Preparing, weights: GpWeights, monkeypatch: pytest.MonkeyPatch
+    preparing: Preparing, weights: Weights, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    learned: list[tuple[Dataset, GpWeights | None]] = []
+    learned: list[tuple[Dataset, Weights | None]] = []
 
-    def train(samples: Dataset, *more: Any) -> GpWeights:
+    def train(samples: Dataset, *more: Any) -> Weights:
         learned.append((samples, more[2]))
         return replace(weights, version=f"round {len(learned)}")
 
@@ -162,7 +162,7 @@ def test_the_controller_learns_from_its_own_laps_of_the_training_track(
 
 
 def test_practice_is_kept_for_all_that_shapes_it(
-    preparing: Preparing, weights: GpWeights, monkeypatch: pytest.MonkeyPatch
+    preparing: Preparing, weights: Weights, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     logs = set()
 

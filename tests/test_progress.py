@@ -15,9 +15,9 @@ from bayesrace.controller.interface import NO_LIMITS, Environment
 from bayesrace.controller.native_step import NativeStep, StepStatus
 from bayesrace.controller.settings import MpcSettings
 from bayesrace.gp.expression import corrected_function
-from bayesrace.gp.weights import GpWeights
+from bayesrace.gp.weights import Weights
 from bayesrace.integrators import PREDICTION
-from bayesrace.vehicles import CarParameters
+from bayesrace.vehicles import Car
 from bayesrace.vehicles.models import dynamic, e_kinematic
 from tests.conftest import SETTINGS, Circuit, discrete, offset_line
 from tests.test_native_planner import nearest
@@ -36,7 +36,7 @@ def artefact() -> Path:
 
 
 def ready(
-    artefact: Path, car: CarParameters, weights: GpWeights, circuit: Circuit, settings: MpcSettings
+    artefact: Path, car: Car, weights: Weights, circuit: Circuit, settings: MpcSettings
 ) -> NativeStep:
     step = NativeStep(artefact, car, settings)
     step.set_weights(weights)
@@ -45,12 +45,12 @@ def ready(
 
 
 @pytest.fixture
-def step(artefact: Path, car: CarParameters, weights: GpWeights, circuit: Circuit) -> NativeStep:
+def step(artefact: Path, car: Car, weights: Weights, circuit: Circuit) -> NativeStep:
     return ready(artefact, car, weights, circuit, MpcSettings())
 
 
 def test_the_converged_step_is_the_solution_of_ipopt(
-    step: NativeStep, car: CarParameters, weights: GpWeights, circuit: Circuit
+    step: NativeStep, car: Car, weights: Weights, circuit: Circuit
 ) -> None:
     """From the plan that drives; the proximal term makes the last digits slow."""
     exact = EXACT.model_copy(update={"iterations": 300, "tolerance": 1e-8})
@@ -91,7 +91,7 @@ def time_on_line(table: PathTable, xy: Floats) -> float:
 
 
 def test_the_reference_is_where_the_plan_is_on_the_line(
-    artefact: Path, car: CarParameters, weights: GpWeights, circuit: Circuit
+    artefact: Path, car: Car, weights: Weights, circuit: Circuit
 ) -> None:
     """Once converged, the feet are those of the plan that is returned."""
     many = SETTINGS.model_copy(update={"iterations": 200, "iterations_cold": 200})
@@ -117,7 +117,7 @@ def test_the_reference_is_where_the_plan_is_on_the_line(
 
 
 def test_bounds_are_nearer_where_the_edge_turns_between_stages(
-    artefact: Path, car: CarParameters, weights: GpWeights, circuit: Circuit
+    artefact: Path, car: Car, weights: Weights, circuit: Circuit
 ) -> None:
     """By the height of the arc over the chord between two stages, inside the bend alone."""
     many = SETTINGS.model_copy(update={"iterations": 200, "iterations_cold": 200})
@@ -142,7 +142,7 @@ def test_bounds_are_nearer_where_the_edge_turns_between_stages(
     assert max(nearer) > 1e-3
 
 
-def another_path(step: NativeStep, circuit: Circuit, _: CarParameters) -> None:
+def another_path(step: NativeStep, circuit: Circuit, _: Car) -> None:
     line = offset_line(circuit.track, -0.05, 4.0, 2.0)
     step.set_path(make_path_table(circuit.track, line, circuit.table.spacing_m))
 
@@ -152,7 +152,7 @@ def another_path(step: NativeStep, circuit: Circuit, _: CarParameters) -> None:
     ids=["nothing", "another path", "other weights", "reset"],
 )  # fmt: skip
 def test_prepared_steps_are_the_same_to_the_bit(
-    artefact: Path, car: CarParameters, weights: GpWeights, circuit: Circuit, between: Between
+    artefact: Path, car: Car, weights: Weights, circuit: Circuit, between: Between
 ) -> None:
     """Whatever happens between a preparation and its step; a stop, too."""
     prepared, plain = (ready(artefact, car, weights, circuit, MpcSettings()) for _ in range(2))
@@ -171,7 +171,7 @@ def test_prepared_steps_are_the_same_to_the_bit(
 
 
 def test_a_car_that_is_measured_elsewhere_is_sought_there_whatever_was_prepared(
-    artefact: Path, car: CarParameters, weights: GpWeights, circuit: Circuit
+    artefact: Path, car: Car, weights: Weights, circuit: Circuit
 ) -> None:
     """At the other side of the waist, for a cycle: nearer to the plan than what lies between."""
     prepared, plain = (ready(artefact, car, weights, circuit, MpcSettings()) for _ in range(2))
@@ -187,7 +187,7 @@ def test_a_car_that_is_measured_elsewhere_is_sought_there_whatever_was_prepared(
 
 
 def test_a_budget_looks_for_no_other_plan(
-    artefact: Path, car: CarParameters, weights: GpWeights, circuit: Circuit
+    artefact: Path, car: Car, weights: Weights, circuit: Circuit
 ) -> None:
     """The costs of two plans do not compare: each counts from its own feet on the line."""
     settings = MpcSettings(iterations=4, iterations_cold=4, caution=0.0)  # it follows throughout
@@ -202,9 +202,7 @@ def test_a_budget_looks_for_no_other_plan(
     assert 0 < max(iterations) <= 4
 
 
-def test_a_stop_brakes_to_standstill(
-    step: NativeStep, car: CarParameters, circuit: Circuit
-) -> None:
+def test_a_stop_brakes_to_standstill(step: NativeStep, car: Car, circuit: Circuit) -> None:
     plant = discrete(dynamic(car))
     x, d, limit = circuit.start(v_mps=1.5), 0.0, math.inf
     for k in range(150):
@@ -218,7 +216,7 @@ def test_a_stop_brakes_to_standstill(
 
 
 def test_a_car_that_points_aside_sets_off_at_once(
-    step: NativeStep, car: CarParameters, circuit: Circuit
+    step: NativeStep, car: Car, circuit: Circuit
 ) -> None:
     """Tracking turns it round at a walking pace first."""
     plant = discrete(dynamic(car))
@@ -231,7 +229,7 @@ def test_a_car_that_points_aside_sets_off_at_once(
 
 
 def test_a_car_that_points_back_turns_and_drives_on(
-    step: NativeStep, car: CarParameters, circuit: Circuit
+    step: NativeStep, car: Car, circuit: Circuit
 ) -> None:
     plant = discrete(dynamic(car))
     x, d, turned, fastest_mps = circuit.start(v_mps=0.1), 0.0, False, 0.0

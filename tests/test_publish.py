@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from bayesrace.defaults import MAX_WEIGHTS_BYTES
-from bayesrace.gp.weights import GpWeights, encode_weights, read_weights, write_weights
+from bayesrace.gp.weights import Weights, encode_weights, read_weights, write_weights
 from bayesrace.transport import free_endpoint
 from tests.command_line import Cli, refused
 from tests.learning_rig import Rig, rigged
@@ -64,7 +64,7 @@ def test_what_are_no_weights_is_said_before_a_controller_is_looked_for(rig: Rig,
 
 def test_another_model_is_refused(rig: Rig, cli: Cli) -> None:
     before = rig.version()
-    weights: GpWeights = read_weights(rig.course.weights_file)
+    weights: Weights = read_weights(rig.course.weights_file)
     path = rig.folder / "foreign.bin"
     write_weights(path, replace(weights, discretisation="bicycle/eulerx1-pose/0.02s/abc"))
     refused(cli("publish", path, "--car", "orca", *rig.endpoints), "refused", code=1)

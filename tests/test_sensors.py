@@ -16,7 +16,7 @@ from bayesrace.plant.process_settings import PlantSettings
 from bayesrace.plant.sensors import Motion, SensorPlayer
 from bayesrace.plant.simulator import Simulator, plant_discretisation
 from bayesrace.sensors import BUILT_IN, EXACT, FIELDS, Sensors, get_sensors, write_sensors
-from bayesrace.vehicles import CarParameters, default_car, read_car, write_car
+from bayesrace.vehicles import Car, default_car, read_car, write_car
 from bayesrace.vehicles.models import dynamic
 from tests.command_line import Cli, refused
 
@@ -151,7 +151,7 @@ def test_the_same_seed_gives_the_same_readings() -> None:
     assert first == [one for one in played(more, 5, seed=4) if one[1].instrument == "pose"]
 
 
-def test_between_two_states_the_car_is_where_the_equations_have_it(car: CarParameters) -> None:
+def test_between_two_states_the_car_is_where_the_equations_have_it(car: Car) -> None:
     """A period of 20 ms against the same in steps of 2 ms, with steps of both inputs."""
     fine = Simulator(dynamic(car), plant_discretisation(500))
     fine.reset((0, 0, 0.3, 1.5, 0, 0, 0.1))

@@ -17,7 +17,7 @@ from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
 from bayesrace.plant.simulator import Simulator
 from bayesrace.plant.vehicle import PlantGuard
-from bayesrace.vehicles import CarParameters, get_car
+from bayesrace.vehicles import Car, get_car
 from bayesrace.vehicles.models import dynamic, e_kinematic, top_command
 from bayesrace.vehicles.parts import LinearTyres
 from tests.cars import with_numbers
@@ -46,7 +46,7 @@ class Axles:
         return -self.p_dy1 * self._stiffness[(self._reads - 1) % 2]
 
 
-def theirs(car: CarParameters) -> Any:
+def theirs(car: Car) -> Any:
     """The car as the package takes it, with actuators that can do anything."""
     numbers = car.equation_numbers
     one = VehicleParameters()
@@ -75,7 +75,7 @@ def state(theirs: Any) -> Floats:
     return np.array([x, y, psi, v * math.cos(beta), v * math.sin(beta), omega, delta])
 
 
-def ours(car: CarParameters, their_state: Any, their_u: Any) -> Floats:
+def ours(car: Car, their_state: Any, their_u: Any) -> Floats:
     x = state(their_state)
     rates = np.asarray(dynamic(car).ode(x, [their_u[1], their_u[0]]), dtype=float).ravel()
     return in_their_form(x, rates)

@@ -15,7 +15,7 @@ from bayesrace.controller.assembly import compiled_controller
 from bayesrace.controller.native_step import NativeStep
 from bayesrace.controller.process_settings import ControllerSettings
 from bayesrace.errors import InputError
-from bayesrace.gp.weights import GpWeights
+from bayesrace.gp.weights import Weights
 from bayesrace.integrators import PREDICTION
 from bayesrace.learning import smoothing
 from bayesrace.learning.dataset import Dataset, concatenate
@@ -34,7 +34,7 @@ from bayesrace.learning.training import fit
 from bayesrace.learning.validation import predictive_sigma
 from bayesrace.messages import Reading, State, Telemetry
 from bayesrace.operation.closed_loop import ClosedLoop
-from bayesrace.vehicles import CarParameters
+from bayesrace.vehicles import Car
 from bayesrace.vehicles.models import dynamic
 from tests.conftest import Make, smooth_drive
 from tests.driven import CAR, QUICK, STEP_S, drive, logged, telemetry
@@ -76,7 +76,7 @@ def of(x: Floats, u: Floats, readings: Sequence[Reading]) -> Drive:
 
 
 def dense(
-    step: NativeStep, weights: GpWeights, car: CarParameters, one: Drive, found: Smoothed
+    step: NativeStep, weights: Weights, car: Car, one: Drive, found: Smoothed
 ) -> tuple[Floats, Floats]:
     """Means (e, 9) and covariance (9 e, 9 e) at all events, of all readings at once: the joint
     Gaussian of the chain that the C code linearises, conditioned by its textbook formula."""
@@ -124,7 +124,7 @@ def dense(
 
 
 def test_it_is_what_all_readings_at_once_say(
-    make: Make, car: CarParameters, weights: GpWeights, monkeypatch: pytest.MonkeyPatch
+    make: Make, car: Car, weights: Weights, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Poses between the ends of periods and a gyro with an offset, reported in any order."""
     monkeypatch.setattr(smoothing, "_LINEARISED", 5)
@@ -158,7 +158,7 @@ def test_it_is_what_all_readings_at_once_say(
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("times", [1e4, 1e25])
 def test_nothing_is_made_of_a_drive_that_the_model_cannot_follow(
-    make: Make, car: CarParameters, weights: GpWeights, times: float
+    make: Make, car: Car, weights: Weights, times: float
 ) -> None:
     """It runs away, to where no car can be, or beyond all numbers."""
     random, step = np.random.default_rng(2), make()
@@ -174,7 +174,7 @@ def test_nothing_is_made_of_a_drive_that_the_model_cannot_follow(
 
 
 def test_what_one_instrument_reads_does_not_keep_another_from_being_heard(
-    car: CarParameters,
+    car: Car,
 ) -> None:
     """The pose jumps for good while a gyro, whose readings pass, reads between the poses."""
     random, readings = np.random.default_rng(1), []
@@ -256,7 +256,7 @@ def blinded(state: State, read: Reading | None) -> State:
 class Blind(ClosedLoop):
     """A race whose controller and learning see late poses alone."""
 
-    def __init__(self, race: Racing, weights: GpWeights, seed: int) -> None:
+    def __init__(self, race: Racing, weights: Weights, seed: int) -> None:
         controller = compiled_controller(race.artefact, race.car, race.track, race.line, weights)
         settings = ControllerSettings(car=race.car)
         super().__init__(race.car, race.track, race.line, controller, settings=settings)

@@ -19,7 +19,7 @@ from bayesrace.gp.expression import evaluate_mean
 from bayesrace.gp.weights import (
     KERNELS,
     OUTPUTS,
-    GpWeights,
+    Weights,
     decode_weights,
     encode_weights,
     write_weights,
@@ -390,7 +390,7 @@ def longer() -> Dataset:
 
 
 @pytest.fixture(scope="module")
-def learned(longer: Dataset) -> GpWeights:
+def learned(longer: Dataset) -> Weights:
     return train(longer, PREDICTION, SMALL)
 
 
@@ -401,7 +401,7 @@ def test_as_many_are_kept_as_wanted(longer: Dataset) -> None:
     assert len(bounded(many, 50)) == 50
 
 
-def test_the_newest_and_the_most_informative_are_kept(longer: Dataset, learned: GpWeights) -> None:
+def test_the_newest_and_the_most_informative_are_kept(longer: Dataset, learned: Weights) -> None:
     """One sample unlike all others, long ago, among hundreds of one kind, is not let go."""
     same = longer.select(np.full(400, 7))
     x, x_next = same.x.copy(), same.x_next.copy()
@@ -418,7 +418,7 @@ def test_the_newest_and_the_most_informative_are_kept(longer: Dataset, learned: 
     assert (spread[0] > 0.8 * spread[1]).all(), "the wealth of the drive is lost"
 
 
-def test_laps_without_end_need_no_more_memory(learned: GpWeights) -> None:
+def test_laps_without_end_need_no_more_memory(learned: Weights) -> None:
     """The bound that is stated: samples times a quarter of what is kept, in doubles, and little."""
     wanted, kept = 200, drive(dynamic(CAR), 100, seed=2)
     lap = drive(dynamic(CAR), 300, seed=3)
@@ -431,7 +431,7 @@ def test_laps_without_end_need_no_more_memory(learned: GpWeights) -> None:
     assert peak < 8 * (wanted + 300) * wanted / 4 + 2e6
 
 
-def test_recalled_samples_teach_what_the_weights_know(longer: Dataset, learned: GpWeights) -> None:
+def test_recalled_samples_teach_what_the_weights_know(longer: Dataset, learned: Weights) -> None:
     samples = recalled(learned, CAR)
     known = residual(samples, PREDICTION)
     np.testing.assert_allclose(known, evaluate_mean(learned, samples.features), atol=1e-12)
@@ -449,9 +449,7 @@ def test_weights_that_know_nothing_recall_nothing() -> None:
     assert len(recalled(zero_weights(CAR.name, name), CAR)) == 0
 
 
-def test_a_task_learns_from_old_and_new(
-    tmp_path: Path, longer: Dataset, learned: GpWeights
-) -> None:
+def test_a_task_learns_from_old_and_new(tmp_path: Path, longer: Dataset, learned: Weights) -> None:
     write_weights(tmp_path / "first.bin", learned)
     samples = [longer.select(slice(0, 150)), longer.select(slice(150, None))]
     outcome = perform(PREDICTION, samples, tmp_path / "first.bin", SMALL, keep=150)

@@ -22,7 +22,7 @@ from bayesrace.operation.analysis.results import RaceResult
 from bayesrace.operation.analysis.validation import validate_weights
 from bayesrace.operation.closed_loop import ClosedLoop, Driven
 from bayesrace.plant.car import CarRun
-from bayesrace.vehicles import CarParameters
+from bayesrace.vehicles import Car
 from bayesrace.vehicles.models import dynamic
 from tests.conftest import Circuit
 from tests.driven import CAR, STEP_S, drive, write_log
@@ -56,7 +56,7 @@ class Spy(PurePursuit):
 
 @pytest.fixture
 def drives(
-    circuit: Circuit, car: CarParameters, kinematic_artefact: Path
+    circuit: Circuit, car: Car, kinematic_artefact: Path
 ) -> Callable[[Path], tuple[Driven, Spy]]:
     line = circuit.line
 
@@ -72,7 +72,7 @@ def drives(
 
 def test_a_sensor_that_errs_misleads_the_controller_and_learning_alone(
     drives: Callable[[Path], tuple[Driven, Spy]],
-    car: CarParameters,
+    car: Car,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

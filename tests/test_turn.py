@@ -12,7 +12,7 @@ from bayesrace.controller.assembly import make_path_table
 from bayesrace.controller.interface import Environment
 from bayesrace.controller.native_step import NativeStep
 from bayesrace.tracks import Track
-from bayesrace.vehicles import CarParameters, default_car
+from bayesrace.vehicles import Car, default_car
 from tests.conftest import SETTINGS, Circuit, offset_line
 from tests.test_driver import Rig
 
@@ -158,7 +158,7 @@ def test_a_stop_on_command_ends_a_turn(native: NativeStep, circuit: Circuit) -> 
 
 
 def test_what_has_failed_is_begun_otherwise_at_once(
-    native: NativeStep, circuit: Circuit, car: CarParameters
+    native: NativeStep, circuit: Circuit, car: Car
 ) -> None:
     """The same cold start over and over would fail for ever where the state does not change."""
     native.set_parameters(car, HOPELESS)
@@ -180,7 +180,7 @@ def test_what_has_failed_is_begun_otherwise_at_once(
 
 @pytest.mark.parametrize("problem", ["tracking", "progress"])
 def test_a_standing_car_creeps_along_its_line_where_no_optimisation_finds_a_plan(
-    circuit: Circuit, car: CarParameters, problem: ProblemName
+    circuit: Circuit, car: Car, problem: ProblemName
 ) -> None:
     """Each cycle has the same problem: one start of 250 stood for ever."""
     step = NativeStep(build(BuildSettings(car=car, problem=problem))[0], car, HOPELESS)

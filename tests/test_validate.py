@@ -11,7 +11,7 @@ from rich.console import Console
 
 from bayesrace.errors import InputError
 from bayesrace.gp.expression import corrected_function
-from bayesrace.gp.weights import OUTPUTS, GpWeights, read_weights, write_weights, zero_weights
+from bayesrace.gp.weights import OUTPUTS, Weights, read_weights, write_weights, zero_weights
 from bayesrace.integrators import PREDICTION, Discretisation
 from bayesrace.learning.dataset import Dataset, concatenate
 from bayesrace.learning.sources import write_npz
@@ -35,12 +35,12 @@ def fresh() -> Dataset:
 
 
 @pytest.fixture(scope="module")
-def weights(driven: Dataset) -> GpWeights:
+def weights(driven: Dataset) -> Weights:
     return train(driven, PREDICTION, QUICK)
 
 
 @pytest.fixture
-def files(tmp_path: Path, weights: GpWeights, driven: Dataset, fresh: Dataset) -> Path:
+def files(tmp_path: Path, weights: Weights, driven: Dataset, fresh: Dataset) -> Path:
     """A folder with weights.bin, driven.mcap and fresh.npz."""
     write_weights(tmp_path / "weights.bin", weights)
     write_log(tmp_path / "driven.mcap", driven)
@@ -74,7 +74,7 @@ def test_the_model_that_drove_has_no_mismatch() -> None:
 
 
 def test_mismatch_is_the_open_loop_prediction_of_the_corrected_map(
-    weights: GpWeights, fresh: Dataset
+    weights: Weights, fresh: Dataset
 ) -> None:
     step = corrected_function(e_kinematic(CAR), PREDICTION, weights)
     found, start = mismatch(fresh, PREDICTION, weights, 20), 7
@@ -85,7 +85,7 @@ def test_mismatch_is_the_open_loop_prediction_of_the_corrected_map(
 
 
 def test_one_step_mismatch_of_the_velocities_is_the_residual(
-    weights: GpWeights, fresh: Dataset
+    weights: Weights, fresh: Dataset
 ) -> None:
     checked = validate(weights, fresh, PREDICTION)
     plain, corrected = (mismatch(fresh, PREDICTION, w, 1) for w in (None, weights))
@@ -144,7 +144,7 @@ def test_weights_are_judged_by_the_discretisation_that_they_were_learned_with(
 
 
 def test_a_drive_shorter_than_the_horizon_has_no_horizon(
-    tmp_path: Path, weights: GpWeights, fresh: Dataset
+    tmp_path: Path, weights: Weights, fresh: Dataset
 ) -> None:
     write_npz(tmp_path / "short.npz", fresh.select(slice(12)))
     result = validate_weights(weights, [tmp_path / "short.npz"]).result
@@ -163,7 +163,7 @@ def test_a_drive_shorter_than_the_horizon_has_no_horizon(
     ],
 )
 def test_weights_that_predict_nothing_finite_are_refused(
-    files: Path, weights: GpWeights, driven: Dataset, change: dict[str, float], fault: str
+    files: Path, weights: Weights, driven: Dataset, change: dict[str, float], fault: str
 ) -> None:
     """Numbers that JSON does not have: huge corrections, or certainty where a sample was."""
     vx, vy, omega = (

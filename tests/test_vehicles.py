@@ -7,7 +7,7 @@ import pytest
 from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
 from bayesrace.integrators import Discretisation
-from bayesrace.vehicles import CarParameters, get_car
+from bayesrace.vehicles import Car, get_car
 from bayesrace.vehicles.models import (
     BLEND_SPEED_MPS,
     MODELS,
@@ -38,7 +38,7 @@ def at_speed(count: int, seed: int = 0) -> list[tuple[Floats, Floats]]:
     return [(p[:7], p[7:]) for p in points]
 
 
-def table_1_dynamic(car: CarParameters, x: Floats, u: Floats) -> Floats:
+def table_1_dynamic(car: Car, x: Floats, u: Floats) -> Floats:
     """Written from the paper, not from the code."""
     _, _, psi, vx, vy, omega, delta = x
     alpha_f = delta - np.arctan((omega * car.lf_m + vy) / vx)
@@ -60,7 +60,7 @@ def table_1_dynamic(car: CarParameters, x: Floats, u: Floats) -> Floats:
     )
 
 
-def table_1_e_kinematic(car: CarParameters, x: Floats, u: Floats) -> Floats:
+def table_1_e_kinematic(car: Car, x: Floats, u: Floats) -> Floats:
     _, _, psi, vx, vy, omega, delta = x
     p = car.equation_numbers
     ax = (p["cm1"] - p["cm2"] * vx) * u[0] / car.mass_kg
@@ -78,7 +78,7 @@ def table_1_e_kinematic(car: CarParameters, x: Floats, u: Floats) -> Floats:
     )
 
 
-def table_1_kinematic(car: CarParameters, x: Floats, u: Floats) -> Floats:
+def table_1_kinematic(car: Car, x: Floats, u: Floats) -> Floats:
     _, _, psi, v, delta = x
     beta = np.arctan(car.lr_m / (car.lf_m + car.lr_m) * np.tan(delta))
     return np.array(
@@ -86,21 +86,21 @@ def table_1_kinematic(car: CarParameters, x: Floats, u: Floats) -> Floats:
     )
 
 
-def test_dynamic_model_is_table_1_at_speed(car: CarParameters) -> None:
+def test_dynamic_model_is_table_1_at_speed(car: Car) -> None:
     model = dynamic(car)
     for x, u in at_speed(200):
         expected = table_1_dynamic(car, x, u)
         np.testing.assert_allclose(rate(model, x, u), expected, rtol=1e-11, atol=1e-11)
 
 
-def test_e_kinematic_model_is_table_1(car: CarParameters) -> None:
+def test_e_kinematic_model_is_table_1(car: Car) -> None:
     model = e_kinematic(car)
     for x, u in at_speed(200, seed=1):
         expected = table_1_e_kinematic(car, x, u)
         np.testing.assert_allclose(rate(model, x, u), expected, rtol=1e-12, atol=1e-12)
 
 
-def test_kinematic_model_is_table_1(car: CarParameters) -> None:
+def test_kinematic_model_is_table_1(car: Car) -> None:
     model = kinematic(car)
     for x7, u in at_speed(200, seed=2):
         x = x7[[0, 1, 2, 3, 6]]
@@ -117,7 +117,7 @@ def derivatives(model: Model) -> ca.Function:
 
 
 @pytest.mark.parametrize("speed", [BLEND_SPEED_MPS, ROLL_SPEED_MPS, -ROLL_SPEED_MPS])
-def test_dynamic_model_is_c2_through_the_blend_speeds(car: CarParameters, speed: float) -> None:
+def test_dynamic_model_is_c2_through_the_blend_speeds(car: Car, speed: float) -> None:
     function = derivatives(dynamic(car))
     u = np.array([0.3, 0.5])
 
@@ -134,7 +134,7 @@ def test_dynamic_model_is_c2_through_the_blend_speeds(car: CarParameters, speed:
 
 @pytest.mark.parametrize("name", ["dynamic", "e_kinematic"])
 @pytest.mark.parametrize("vx", [0.0, -0.0, 1e-12, -1e-3, -0.1, -0.5])
-def test_nothing_is_nan_at_and_below_standstill(car: CarParameters, name: str, vx: float) -> None:
+def test_nothing_is_nan_at_and_below_standstill(car: Car, name: str, vx: float) -> None:
     x, u = ca.SX.sym("x", 7), ca.SX.sym("u", 2)
     model = MODELS[name](car)
     xdot = model.ode(x, u)
@@ -147,7 +147,7 @@ def test_nothing_is_nan_at_and_below_standstill(car: CarParameters, name: str, v
 
 
 @pytest.mark.parametrize("name", sorted(MODELS))
-def test_a_standing_car_stays_where_it_is(car: CarParameters, name: str) -> None:
+def test_a_standing_car_stays_where_it_is(car: Car, name: str) -> None:
     model = MODELS[name](car)
     x = np.zeros(len(model.states))
     x[-1] = 0.2  # steering turned
@@ -155,7 +155,7 @@ def test_a_standing_car_stays_where_it_is(car: CarParameters, name: str) -> None
 
 
 def test_a_coasting_car_stops_and_rolling_resistance_never_pushes_it_back(
-    car: CarParameters,
+    car: Car,
 ) -> None:
     step = TRUTH.discretise(dynamic(car))
     for delta in (0.0, 0.3):
@@ -168,7 +168,7 @@ def test_a_coasting_car_stops_and_rolling_resistance_never_pushes_it_back(
         assert speeds[-1] < 1e-6
 
 
-def test_rolling_resistance_opposes_the_motion_on_both_sides(car: CarParameters) -> None:
+def test_rolling_resistance_opposes_the_motion_on_both_sides(car: Car) -> None:
     model = dynamic(car)
     for v in (1e-4, 0.01, 0.05, 1.0):
         forward, backward = (
@@ -180,7 +180,7 @@ def test_rolling_resistance_opposes_the_motion_on_both_sides(car: CarParameters)
 
 
 @pytest.mark.parametrize("name", ["dynamic", "e_kinematic"])
-def test_mirror_symmetry(car: CarParameters, name: str) -> None:
+def test_mirror_symmetry(car: Car, name: str) -> None:
     model = MODELS[name](car)
     slow = [(np.array([0.3, 1, 0.5, v, 0.02, 1, 0.2]), np.array([0.5, -2])) for v in (0, 0.05)]
     for x, u in [*at_speed(50, seed=3), *slow]:
@@ -189,7 +189,7 @@ def test_mirror_symmetry(car: CarParameters, name: str) -> None:
 
 
 @pytest.mark.parametrize("delta", [0.02, 0.04])
-def test_e_kinematic_equals_kinematic_in_a_gentle_turn(car: CarParameters, delta: float) -> None:
+def test_e_kinematic_equals_kinematic_in_a_gentle_turn(car: Car, delta: float) -> None:
     """Steering slowly to delta: the same path up to terms of second order in delta."""
     v, ends = 1.5, []
     for model in (kinematic(car), e_kinematic(car)):

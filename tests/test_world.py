@@ -11,7 +11,7 @@ from bayesrace.operation.closed_loop import built_in_car
 from bayesrace.operation.settings import RaceSettings
 from bayesrace.plant.settings import CarSimulation
 from bayesrace.plant.world import UNCHANGED, Change, World, get_world, write_world
-from bayesrace.vehicles import CarParameters, default_car, get_car
+from bayesrace.vehicles import Car, default_car, get_car
 from tests.changed_cars import CHANGES
 
 START = (0.0, 0.0, 0.0, 2.0, 0.0, 0.0, 0.1)
@@ -19,7 +19,7 @@ GRIP = Change(what="grip", share=0.8, from_s=0.1)
 
 
 def driven(
-    car: CarParameters, world: World = UNCHANGED, start: tuple[float, ...] = START
+    car: Car, world: World = UNCHANGED, start: tuple[float, ...] = START
 ) -> list[list[float]]:
     """States after each of twenty periods in a bend."""
     vehicle = built_in_car(car, world)

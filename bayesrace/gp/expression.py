@@ -25,7 +25,7 @@ from scipy.spatial.distance import cdist
 
 from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
-from bayesrace.gp.weights import FEATURES, KERNELS, OUTPUTS, GpOutput, GpWeights
+from bayesrace.gp.weights import FEATURES, KERNELS, OUTPUTS, GpOutput, Weights
 from bayesrace.integrators import Discretisation
 from bayesrace.vehicles.models import Model
 
@@ -96,14 +96,14 @@ def _posterior_mean(output: GpOutput, z: Any) -> Any:
     return output.y_mean + amplitude * ca.dot(ca.DM(output.alpha), kernel(output.kernel, r2))
 
 
-def mean_function(weights: GpWeights) -> ca.Function:
+def mean_function(weights: Weights) -> ca.Function:
     """Function z (6, 1) -> mean (3, 1) of these weights, SI units; z (6, m) gives (3, m)."""
     z = ca.MX.sym("z", len(FEATURES))
     means = [_posterior_mean(output, z) for output in weights.outputs]
     return ca.Function("gp_mean", [z], [ca.vertcat(*means)], ["z"], ["mean"])
 
 
-def evaluate_mean(weights: GpWeights, z: ArrayLike) -> Floats:
+def evaluate_mean(weights: Weights, z: ArrayLike) -> Floats:
     """Posterior mean (m, 3) at features ``z`` (m, 6), all in SI units."""
     points = np.asarray(z, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != len(FEATURES):
@@ -116,7 +116,7 @@ def evaluate_mean(weights: GpWeights, z: ArrayLike) -> Floats:
 def corrected_function(
     model: Model,
     discretisation: Discretisation,
-    weights: GpWeights | None,
+    weights: Weights | None,
     check_identity: bool = True,
 ) -> ca.Function:
     """``(x, u) -> x_next`` of the discretised model plus the posterior mean, as MX function.

@@ -37,7 +37,7 @@ __all__ = [
     "SCHEMA",
     "UNITS",
     "GpOutput",
-    "GpWeights",
+    "Weights",
     "decode_weights",
     "encode_weights",
     "OUTPUT_HEAD",
@@ -106,7 +106,7 @@ def _adapters(kind: type) -> dict[str, TypeAdapter[Any]]:
     return {name: TypeAdapter(of) for name, of in get_type_hints(kind, include_extras=True).items()}
 
 
-def _validate(item: "GpOutput | GpWeights") -> None:
+def _validate(item: "GpOutput | Weights") -> None:
     """Replaces each field by its validated value; InputError names the field and its fault."""
     kind: Any = type(item)
     for name, adapter in _adapters(kind).items():
@@ -174,7 +174,7 @@ _Outputs = tuple[InstanceOf[GpOutput], InstanceOf[GpOutput], InstanceOf[GpOutput
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class GpWeights:
+class Weights:
     """The residual GP of one car for one discretised nominal model.
 
     ``discretisation`` is :meth:`bayesrace.integrators.Discretisation.identity` of the model that
@@ -233,7 +233,7 @@ class GpWeights:
         return tuple(output.count for output in self.outputs)
 
     def __eq__(self, other: object) -> bool:
-        if not isinstance(other, GpWeights):
+        if not isinstance(other, Weights):
             return NotImplemented
         return encode_weights(self) == encode_weights(other)
 
@@ -241,7 +241,7 @@ class GpWeights:
         return hash(encode_weights(self))
 
 
-def zero_weights(car: str, discretisation: str, version: str = "worstcase") -> GpWeights:
+def zero_weights(car: str, discretisation: str, version: str = "worstcase") -> Weights:
     """Weights without a training point: the correction is exactly zero (WorstCase)."""
     width = len(FEATURES)
     zero = GpOutput(
@@ -252,7 +252,7 @@ def zero_weights(car: str, discretisation: str, version: str = "worstcase") -> G
         inputs=np.zeros((0, width)),
         alpha=np.zeros(0),
     )
-    return GpWeights(
+    return Weights(
         version=version, car=car, discretisation=discretisation, outputs=(zero, zero, zero)
     )
 
@@ -264,7 +264,7 @@ def _packed(value: Any) -> Any:
     return vars(value)
 
 
-def encode_weights(weights: GpWeights) -> bytes:
+def encode_weights(weights: Weights) -> bytes:
     """The one byte string for these weights; :func:`decode_weights` is its inverse.
 
     InputError if it is longer than what a controller can be sent.
@@ -326,14 +326,14 @@ def _body(data: bytes) -> Any:
         raise InputError("GP weights: the body cannot be decoded; train again") from error
 
 
-def decode_weights(data: bytes) -> GpWeights:
+def decode_weights(data: bytes) -> Weights:
     """Weights from :func:`encode_weights`; InputError for any other bytes."""
     body = _body(bytes(data))
     try:
         made_for = body.pop("features"), body.pop("output_names")
         outputs: Any = tuple(map(_output, body.pop("outputs")))
         samples = {name: _array(body[name]) for name in ("sample_features", "sample_residuals")}
-        weights = GpWeights(**body | samples, outputs=outputs)
+        weights = Weights(**body | samples, outputs=outputs)
     except InputError:
         raise
     except (AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
@@ -345,7 +345,7 @@ def decode_weights(data: bytes) -> GpWeights:
     return weights
 
 
-def pack_weights(weights: GpWeights) -> bytes:
+def pack_weights(weights: Weights) -> bytes:
     """What the compiled step needs of them, as in the weights file of hosts in C.
 
     For each output the members of br_mpc_gp: kernel and points as u32, offset, scale, signal, noise
@@ -360,7 +360,7 @@ def pack_weights(weights: GpWeights) -> bytes:
     return b"".join(parts)
 
 
-def write_weights(path: str | os.PathLike[str], weights: GpWeights) -> None:
+def write_weights(path: str | os.PathLike[str], weights: Weights) -> None:
     """Writes the encoded weights; the file appears whole or not at all."""
     try:
         write_whole(Path(path), encode_weights(weights))
@@ -368,7 +368,7 @@ def write_weights(path: str | os.PathLike[str], weights: GpWeights) -> None:
         raise InputError(f"cannot write weights file {path}: {error.strerror}") from error
 
 
-def read_weights(path: str | os.PathLike[str]) -> GpWeights:
+def read_weights(path: str | os.PathLike[str]) -> Weights:
     """Weights from a file; InputError names the file and what is wrong with it."""
     data = read_whole(Path(path), "weights file", MAX_WEIGHTS_BYTES)
     try:

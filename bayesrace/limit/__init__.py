@@ -15,7 +15,7 @@ from bayesrace.errors import InputError
 from bayesrace.limit.lap import LimitLap, LimitSettings, read_limit, write_limit
 from bayesrace.raceline import optimised_identity
 from bayesrace.tracks import Track
-from bayesrace.vehicles.parameters import CarParameters
+from bayesrace.vehicles.parameters import Car
 
 __all__ = [
     "LimitLap",
@@ -28,9 +28,7 @@ __all__ = [
 ]
 
 
-def compute_limit(
-    track: Track, car: CarParameters, settings: LimitSettings | None = None
-) -> LimitLap:
+def compute_limit(track: Track, car: Car, settings: LimitSettings | None = None) -> LimitLap:
     """The fastest lap of ``car`` on ``track``; see :mod:`bayesrace.limit.solve`.
 
     Raises InputError when the margin leaves no room or no lap is found.
@@ -40,7 +38,7 @@ def compute_limit(
     return solve(track, car, settings or LimitSettings())
 
 
-def limit_lap(track: Track, car: CarParameters, settings: LimitSettings | None = None) -> LimitLap:
+def limit_lap(track: Track, car: Car, settings: LimitSettings | None = None) -> LimitLap:
     """:func:`compute_limit`, or what it returned for the same track, car and settings before."""
     settings = settings or LimitSettings()
     return kept(
@@ -50,13 +48,13 @@ def limit_lap(track: Track, car: CarParameters, settings: LimitSettings | None =
     )
 
 
-def known_limit(track: Track, car: CarParameters, settings: LimitSettings) -> LimitLap | None:
+def known_limit(track: Track, car: Car, settings: LimitSettings) -> LimitLap | None:
     """The limit if it was computed before."""
     with suppress(InputError):
         return read_limit(_file(track, car, settings))
     return None
 
 
-def _file(track: Track, car: CarParameters, settings: LimitSettings) -> Path:
+def _file(track: Track, car: Car, settings: LimitSettings) -> Path:
     """Named after car, track, settings and code."""
     return cache_folder() / f"limit-{optimised_identity(track, car, settings)}.csv"

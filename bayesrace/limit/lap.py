@@ -51,7 +51,7 @@ class LimitLap:
     """The fastest lap of a car on a track, as minimum-time optimal control finds it."""
 
     car: str
-    """Name and digest: :attr:`bayesrace.vehicles.CarParameters.identity`."""
+    """Name and digest: :attr:`bayesrace.vehicles.Car.identity`."""
     track: str
     """Name and digest: :attr:`bayesrace.tracks.Track.identity`."""
     lap_s: float

@@ -24,7 +24,7 @@ from bayesrace.raceline.gates import Gates
 from bayesrace.raceline.nlp import Indices, Piece, Solution, minimise
 from bayesrace.tracks import Track
 from bayesrace.vehicles.models import Model, command_limits
-from bayesrace.vehicles.parameters import CarParameters
+from bayesrace.vehicles.parameters import Car
 from bayesrace.vehicles.parts import GRAVITY_MPS2, LinearTyres
 
 __all__ = ["Lap", "Outline", "optimise", "usual_interval"]
@@ -48,7 +48,7 @@ _ALONG: Final = 9
 """Points on each of the outline's long sides, corners included."""
 
 
-def usual_interval(car: CarParameters) -> tuple[float, float]:
+def usual_interval(car: Car) -> tuple[float, float]:
     """Length [m] and duration [s] of the first mesh's intervals."""
     length_m, usable = _INTERVAL * car.tuning.raceline.step_m, car.friction * GRAVITY_MPS2
     return length_m, length_m / (2 * float(np.sqrt(usable * car.wheelbase_m)))
@@ -93,7 +93,7 @@ class Lap:
 class _Layout:
     """Where the variables of gates and intervals are in the programme's x, and their sizes."""
 
-    def __init__(self, gates: Gates, car: CarParameters) -> None:
+    def __init__(self, gates: Gates, car: Car) -> None:
         tuned, drive = car.tuning.scale, max(-car.d_min, car.d_max)
         self.scale = np.array([
             car.width_m, 1.0, tuned.speed_mps, tuned.speed_mps, tuned.yaw_rate_radps,
@@ -158,7 +158,7 @@ def _at_gates(layout: _Layout, within: Callable[[Any], list[Any]]) -> Piece:
     return Piece(y, ca.vertcat(*within(y * layout.scale)), -np.inf, 0.0, layout.gate, nothing)
 
 
-def _car_within(car: CarParameters, layout: _Layout) -> Iterator[Piece]:
+def _car_within(car: Car, layout: _Layout) -> Iterator[Piece]:
     """What the bounds of the inputs and of the steering angle do not say about a car."""
     if car.drive.guarded:
         yield _at_gates(
@@ -173,7 +173,7 @@ def _car_within(car: CarParameters, layout: _Layout) -> Iterator[Piece]:
         )
 
 
-def _bounds(car: CarParameters, layout: _Layout, settings: LimitSettings) -> tuple[Floats, Floats]:
+def _bounds(car: Car, layout: _Layout, settings: LimitSettings) -> tuple[Floats, Floats]:
     """Of x."""
     gates, top = layout.gates, car.tuning.raceline.speed_bound_mps
     aside, spin = settings.lateral_speed_mps or top, 20 * layout.scale[4]
@@ -200,7 +200,7 @@ class Outline:
     offset of a point from an arc of the centreline is exact, and needs no foot point as a variable.
     """
 
-    def __init__(self, track: Track, car: CarParameters, margin_m: float) -> None:
+    def __init__(self, track: Track, car: Car, margin_m: float) -> None:
         self._track, self._margin_m = track, margin_m
         self._near_m, self._smoothing_m = car.width_m, car.tuning.raceline.smoothing_m
         ahead = np.linspace(0.5, -0.5, _ALONG) * car.length_m

@@ -15,7 +15,7 @@ from bayesrace.raceline.gates import Gates, flying_gates, smooth_centreline, sta
 from bayesrace.tracks import Track
 from bayesrace.tracks.spline import CentrelineSearch, PlaneSpline
 from bayesrace.vehicles.models import dynamic
-from bayesrace.vehicles.parameters import CarParameters
+from bayesrace.vehicles.parameters import Car
 from bayesrace.vehicles.parts import GRAVITY_MPS2
 
 __all__ = ["solve"]
@@ -60,7 +60,7 @@ class _Guess:
     """A racing line as a function of the place on the smoothed centreline."""
 
     def __init__(
-        self, line: RaceLine, curve: PlaneSpline, car: CarParameters, settings: LimitSettings
+        self, line: RaceLine, curve: PlaneSpline, car: Car, settings: LimitSettings
     ) -> None:
         self._curve, self._car, self._settings = curve, car, settings
         spacing = line.length_m / len(line.s_m)
@@ -126,7 +126,7 @@ class _NoLapError(InputError):
 class _Limit:
     """The optimisation of one lap, on any mesh: the dynamic model on a track."""
 
-    def __init__(self, track: Track, car: CarParameters, settings: LimitSettings) -> None:
+    def __init__(self, track: Track, car: Car, settings: LimitSettings) -> None:
         self._track, self._car, self._settings = track, car, settings
         self._curve = smooth_centreline(track, car.tuning.raceline)
         self._guess = _Guess(racing_line(track, car), self._curve, car, settings)
@@ -181,7 +181,7 @@ class _Limit:
         )
 
 
-def solve(track: Track, car: CarParameters, settings: LimitSettings) -> LimitLap:
+def solve(track: Track, car: Car, settings: LimitSettings) -> LimitLap:
     """The limit of ``car`` on ``track``: the dynamic model, on meshes fine enough.
 
     Raises InputError if the margin leaves no room, or no lap is found.

@@ -24,7 +24,7 @@ from bayesrace.raceline.line import (
     write_raceline,
 )
 from bayesrace.tracks import Track
-from bayesrace.vehicles.parameters import CarParameters
+from bayesrace.vehicles.parameters import Car
 
 __all__ = [
     "LineIdentity",
@@ -43,9 +43,7 @@ __all__ = [
 ]
 
 
-def compute_raceline(
-    track: Track, car: CarParameters, settings: RaceLineSettings | None = None
-) -> RaceLine:
+def compute_raceline(track: Track, car: Car, settings: RaceLineSettings | None = None) -> RaceLine:
     """Minimum-time flying lap of ``car`` on ``track``; see :mod:`bayesrace.raceline.ocp`.
 
     Raises InputError when the margin leaves no room, RaceLineError when the optimiser fails.
@@ -55,9 +53,7 @@ def compute_raceline(
     return solve(track, car, settings or RaceLineSettings())
 
 
-def racing_line(
-    track: Track, car: CarParameters, settings: RaceLineSettings | None = None
-) -> RaceLine:
+def racing_line(track: Track, car: Car, settings: RaceLineSettings | None = None) -> RaceLine:
     """:func:`compute_raceline`, or what it returned for the same track, car and settings before."""
     settings = settings or RaceLineSettings()
     return kept(
@@ -67,13 +63,13 @@ def racing_line(
     )
 
 
-def raceline_file(track: Track, car: CarParameters, settings: RaceLineSettings) -> Path:
+def raceline_file(track: Track, car: Car, settings: RaceLineSettings) -> Path:
     """Where the line is kept, in a folder named after car, track, settings and code."""
     identity = optimised_identity(track, car, settings)
     return cache_folder() / f"line-{identity}" / "race_raceline.csv"
 
 
-def optimised_identity(track: Track, car: CarParameters, settings: BaseModel) -> str:
+def optimised_identity(track: Track, car: Car, settings: BaseModel) -> str:
     """Digest of all that shapes a racing line or a limit of a car on a track."""
     sources = ("vehicles", "tracks", "raceline", "limit")
     inputs = [car.model_dump_json(), settings.model_dump_json(), track.identity]

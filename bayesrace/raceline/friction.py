@@ -23,7 +23,7 @@ from bayesrace.raceline.line import RaceLine, RaceLineSettings
 from bayesrace.tracks import Track
 from bayesrace.tracks.spline import PlaneSpline, fit_arc_length
 from bayesrace.vehicles.models import longitudinal_force, top_command
-from bayesrace.vehicles.parameters import CarParameters
+from bayesrace.vehicles.parameters import Car
 from bayesrace.vehicles.parts import GRAVITY_MPS2
 
 __all__ = [
@@ -53,7 +53,7 @@ _BEYOND: Final = 1.2
 class CarLimits:
     """What the car can do, from what one can measure; works on numbers and CasADi expressions."""
 
-    car: CarParameters
+    car: Car
     grip_mps2: float
     """Radius of the friction circle."""
     straight: ca.Function
@@ -92,7 +92,7 @@ class CarLimits:
         return speed_profile(kappa, step, self.grip_mps2, drive, brake, v_min, v_max)
 
 
-def car_limits(car: CarParameters, settings: RaceLineSettings) -> CarLimits:
+def car_limits(car: Car, settings: RaceLineSettings) -> CarLimits:
     """The limits of a car, friction from the settings or else the car's."""
     v, d = ca.SX.sym("v"), ca.SX.sym("d")
     acting = ca.fmin(d, top_command(car, v, car.d_max))
@@ -158,9 +158,7 @@ class NodeLines:
     on the right, to 1, on the left. The first node is on the start line.
     """
 
-    def __init__(
-        self, track: Track, car: CarParameters, settings: RaceLineSettings, count: int
-    ) -> None:
+    def __init__(self, track: Track, car: Car, settings: RaceLineSettings, count: int) -> None:
         """Raises InputError if the margin leaves no room at a node."""
         self._track, self._car = track, car
         self._settings = settings
@@ -196,9 +194,7 @@ class NodeLines:
         return None
 
 
-def timed_line(
-    name: str, path: PlaneSpline, car: CarParameters, settings: RaceLineSettings
-) -> RaceLine:
+def timed_line(name: str, path: PlaneSpline, car: Car, settings: RaceLineSettings) -> RaceLine:
     """A closed path, evenly sampled, with the fastest speeds of a flying lap along it."""
     at, limits = _sampled(path, car), car_limits(car, settings)
     xy, first, second = path.derivatives(at)
@@ -213,7 +209,7 @@ def timed_line(
     return RaceLine(name, s, xy[:, 0], xy[:, 1], psi, kappa, v, a, float(step.sum()))
 
 
-def _sampled(path: PlaneSpline, car: CarParameters) -> Floats:
+def _sampled(path: PlaneSpline, car: Car) -> Floats:
     count = max(24, round(path.period / car.tuning.raceline.spacing_m))
     return np.arange(count, dtype=np.float64) * (path.period / count)
 

@@ -19,7 +19,7 @@ from bayesrace.cache import digest
 from bayesrace.errors import InputError
 from bayesrace.tracks import Track
 from bayesrace.tracks.tables import read_table, write_table
-from bayesrace.vehicles.parameters import CarParameters
+from bayesrace.vehicles.parameters import Car
 
 __all__ = [
     "LineIdentity",
@@ -65,7 +65,7 @@ class LineIdentity:
     """What a racing line was made for."""
 
     car: str
-    """Name and digest: :attr:`bayesrace.vehicles.CarParameters.identity`."""
+    """Name and digest: :attr:`bayesrace.vehicles.Car.identity`."""
     width_m: float
     """Of the car, which the distance from the edges follows."""
     friction: float
@@ -189,7 +189,7 @@ def _made_for(about: dict[str, str]) -> LineIdentity | None:
     return made if math.isfinite(width_m) and math.isfinite(friction) else None
 
 
-def line_identity(track: Track, car: CarParameters, settings: RaceLineSettings) -> LineIdentity:
+def line_identity(track: Track, car: Car, settings: RaceLineSettings) -> LineIdentity:
     """Of the line that these give."""
     return LineIdentity(
         car=car.identity,
@@ -200,7 +200,7 @@ def line_identity(track: Track, car: CarParameters, settings: RaceLineSettings) 
     )
 
 
-def check_line(line: RaceLine, track: Track, car: CarParameters, where: str) -> None:
+def check_line(line: RaceLine, track: Track, car: Car, where: str) -> None:
     """InputError, beginning with ``where``, if the line was made for another car, grip or track.
 
     Names do not count, only what they stand for. A line that does not say what it was made for is
@@ -238,7 +238,7 @@ def _shape(identity: str) -> str:
     return identity.rpartition("-")[2]
 
 
-def read_raceline_for(path: Path, track: Track, car: CarParameters) -> RaceLine:
+def read_raceline_for(path: Path, track: Track, car: Car) -> RaceLine:
     """The racing line in a file, to be driven by ``car`` on ``track``; see :func:`check_line`."""
     line = read_raceline(path, track.name)
     check_line(line, track, car, str(path))

@@ -29,7 +29,7 @@ from bayesrace.raceline.gates import Gates, even_places, flying_gates, smooth_ce
 from bayesrace.raceline.line import RaceLine, RaceLineError, RaceLineSettings, line_identity
 from bayesrace.raceline.nlp import solve_nlp
 from bayesrace.tracks import StartLine, Track
-from bayesrace.vehicles.parameters import CarParameters
+from bayesrace.vehicles.parameters import Car
 
 __all__ = ["solve"]
 
@@ -45,7 +45,7 @@ _SLOWER: Final = 0.4
 _GAUSS_X, _GAUSS_W = np.polynomial.legendre.leggauss(6)
 
 
-def solve(track: Track, car: CarParameters, settings: RaceLineSettings) -> RaceLine:
+def solve(track: Track, car: Car, settings: RaceLineSettings) -> RaceLine:
     """Racing line of ``car`` on ``track``; raises InputError or RaceLineError.
 
     The margin holds at the gates; should the path between them come nearer to the real edge than

@@ -3,7 +3,7 @@
 
 from bayesrace.vehicles.parameters import (
     DEFAULT_CAR,
-    CarParameters,
+    Car,
     CarSetting,
     builtin_cars,
     car_text,
@@ -17,7 +17,7 @@ from bayesrace.vehicles.tuning import Tuning
 
 __all__ = [
     "DEFAULT_CAR",
-    "CarParameters",
+    "Car",
     "CarSetting",
     "Tuning",
     "builtin_cars",

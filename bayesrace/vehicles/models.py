@@ -17,7 +17,7 @@ from typing import Any, Final
 
 import casadi as ca
 
-from bayesrace.vehicles.parameters import BODY, CarParameters
+from bayesrace.vehicles.parameters import BODY, Car
 from bayesrace.vehicles.parts import (
     GRAVITY_MPS2,
     AccelerationDrive,
@@ -60,7 +60,7 @@ class Model:
     """A vehicle model: ``ode`` maps (x, u) to xdot, both column vectors in SI units."""
 
     name: str
-    car: CarParameters
+    car: Car
     ode: ca.Function
     states: tuple[str, ...] = STATES
     inputs: tuple[str, ...] = INPUTS
@@ -89,7 +89,7 @@ def _smooth_step(v: Any) -> Any:
     return z**3 * (10 - 15 * z + 6 * z**2)
 
 
-def motor_force(car: CarParameters, vx: Any, d: Any) -> Any:
+def motor_force(car: Car, vx: Any, d: Any) -> Any:
     """Longitudinal force of the drive without resistances [N].
 
     Of the DC motor (Cm1 - Cm2 vx) d, section 3 of the paper; else mass times the acceleration d.
@@ -98,7 +98,7 @@ def motor_force(car: CarParameters, vx: Any, d: Any) -> Any:
     return (drive.cm1 - drive.cm2 * vx) * d if isinstance(drive, DcMotor) else car.mass_kg * d
 
 
-def longitudinal_force(car: CarParameters, vx: Any, d: Any) -> Any:
+def longitudinal_force(car: Car, vx: Any, d: Any) -> Any:
     """F_r,x of the true car: drive less rolling and drag resistance [N]; section 3 of the paper.
 
     Rolling resistance Cr + Cd vx^2 is opposed to the motion: it stops a car and cannot push it
@@ -110,7 +110,7 @@ def longitudinal_force(car: CarParameters, vx: Any, d: Any) -> Any:
     return force - (drive.cr0 * _smooth_sign(vx, ROLL_SPEED_MPS) + drive.cr2 * vx * ca.fabs(vx))
 
 
-def top_command(car: CarParameters, v: Any, d_max: Any) -> Any:
+def top_command(car: Car, v: Any, d_max: Any) -> Any:
     """Highest drive command that acts at a speed v; the plant's guard has it in numbers."""
     drive = car.drive
     if not isinstance(drive, AccelerationDrive):
@@ -120,7 +120,7 @@ def top_command(car: CarParameters, v: Any, d_max: Any) -> Any:
     return d_max * share * ca.fmin(ca.fmax(fade, 0), 1)
 
 
-def command_limits(car: CarParameters, v: Any, d: Any) -> list[Any]:
+def command_limits(car: Car, v: Any, d: Any) -> list[Any]:
     """Smooth expressions, over d_max; none is above 0 where d is within :func:`top_command`.
 
     For optimisers, which end badly at the bends of a minimum: there is one for each of its parts.
@@ -137,7 +137,7 @@ def _lateral_force(tyre: Pacejka, alpha: Any) -> Any:
     return tyre.d * ca.sin(tyre.c * ca.atan(tyre.b * alpha))
 
 
-def _slip_angles(car: CarParameters, x: Any) -> tuple[Any, Any]:
+def _slip_angles(car: Car, x: Any) -> tuple[Any, Any]:
     """Front and rear slip angle from the wheels' own velocities (equal to table 1 at speed).
 
     In the frame of the turned front wheel, alpha_f = -atan(v_lateral / |v_rolling|), which is
@@ -165,7 +165,7 @@ def _function(name: str, x: Any, u: Any, xdot: list[Any]) -> ca.Function:
     return ca.Function(name, [x, u], [ca.vertcat(*xdot)], ["x", "u"], ["xdot"])
 
 
-def dynamic(car: CarParameters) -> Model:
+def dynamic(car: Car) -> Model:
     """Single-track model of the true car (paper table 1, middle column).
 
     Pacejka tyres are the paper's; linear ones are those of CommonRoad's single-track model.
@@ -176,10 +176,10 @@ def dynamic(car: CarParameters) -> Model:
     return Model("dynamic", car, ode, any_car=dynamic_with_parameters(car), parameters=parameters)
 
 
-def dynamic_with_parameters(like: CarParameters) -> ca.Function:
+def dynamic_with_parameters(like: Car) -> ca.Function:
     """The dynamic model for any car with such tyres and drive: (x, u, p) -> xdot.
 
-    p is as :attr:`CarParameters.equation_numbers`. With the numbers of a car it is :func:`dynamic`
+    p is as :attr:`Car.equation_numbers`. With the numbers of a car it is :func:`dynamic`
     but for the rounding of folded constants.
     """
     x, u = ca.SX.sym("x", 7), ca.SX.sym("u", 2)
@@ -189,8 +189,8 @@ def dynamic_with_parameters(like: CarParameters) -> ca.Function:
     return ca.Function("dynamic", [x, u, p], [xdot], ["x", "u", "p"], ["xdot"])
 
 
-def _symbolic(like: CarParameters, symbols: Iterator[Any]) -> CarParameters:
-    """A car whose numbers are symbols, in the order of :attr:`CarParameters.equation_numbers`."""
+def _symbolic(like: Car, symbols: Iterator[Any]) -> Car:
+    """A car whose numbers are symbols, in the order of :attr:`Car.equation_numbers`."""
 
     def of(value: Any) -> Any:
         if isinstance(value, Part):
@@ -202,7 +202,7 @@ def _symbolic(like: CarParameters, symbols: Iterator[Any]) -> CarParameters:
     return like.model_copy(update=values | {"drive": drive})
 
 
-def _dynamic_rates(car: CarParameters, x: Any, u: Any) -> list[Any]:
+def _dynamic_rates(car: Car, x: Any, u: Any) -> list[Any]:
     """The equations; the car's values may be numbers or symbols."""
     tyres = car.true_tyres
     if isinstance(tyres, LinearTyres):
@@ -210,7 +210,7 @@ def _dynamic_rates(car: CarParameters, x: Any, u: Any) -> list[Any]:
     return [*_pose_rates(x), *_pacejka_rates(car, tyres, x, u), u[1]]
 
 
-def _pacejka_rates(car: CarParameters, tyres: PacejkaTyres, x: Any, u: Any) -> list[Any]:
+def _pacejka_rates(car: Car, tyres: PacejkaTyres, x: Any, u: Any) -> list[Any]:
     """Of vx, vy, omega."""
     vx, vy, omega, delta = x[3], x[4], x[5], x[6]
     alpha_f, alpha_r = _slip_angles(car, x)
@@ -224,7 +224,7 @@ def _pacejka_rates(car: CarParameters, tyres: PacejkaTyres, x: Any, u: Any) -> l
     ]
 
 
-def _linear_rates(car: CarParameters, tyres: LinearTyres, x: Any, u: Any) -> list[Any]:
+def _linear_rates(car: Car, tyres: LinearTyres, x: Any, u: Any) -> list[Any]:
     """Of vx, vy, omega: CommonRoad's single-track model, kinematic at low speed.
 
     Above ``switch_mps`` these are its equations for v = |(vx, vy)| and beta = atan2(vy, vx) by the
@@ -244,7 +244,7 @@ def _linear_rates(car: CarParameters, tyres: LinearTyres, x: Any, u: Any) -> lis
 
 
 def _single_track_rates(
-    car: CarParameters, tyres: LinearTyres, vx: Any, vy: Any, x: Any, a: Any
+    car: Car, tyres: LinearTyres, vx: Any, vy: Any, x: Any, a: Any
 ) -> list[Any]:
     """Of vx, vy, omega on linear tyres; ``a`` [m/s^2] is along the velocity.
 
@@ -273,9 +273,7 @@ def _single_track_rates(
     ]
 
 
-def _rolling_rates(
-    car: CarParameters, tyres: LinearTyres, x: Any, delta_rate: Any, a: Any
-) -> list[Any]:
+def _rolling_rates(car: Car, tyres: LinearTyres, x: Any, delta_rate: Any, a: Any) -> list[Any]:
     """Of vx, vy, omega of a car that rolls without slip; ``a`` is along the velocity.
 
     What slip there is fades as fast as it does on the tyres at ``switch_mps``.
@@ -297,7 +295,7 @@ def _rolling_rates(
     ]
 
 
-def e_kinematic(car: CarParameters) -> Model:
+def e_kinematic(car: Car) -> Model:
     """Extended kinematic model (paper table 1, right column): lf, lr and mass only.
 
     The yaw acceleration divides by lf + lr as the paper prints it (its published code multiplies).
@@ -311,7 +309,7 @@ def e_kinematic(car: CarParameters) -> Model:
     return Model("e_kinematic", car, _function("e_kinematic", x, u, xdot))
 
 
-def kinematic(car: CarParameters) -> Model:
+def kinematic(car: Car) -> Model:
     """Kinematic bicycle model (paper table 1, left column); u = [a m/s^2, delta_rate rad/s]."""
     x, u = ca.SX.sym("x", 5), ca.SX.sym("u", 2)
     psi, v, delta = x[2], x[3], x[4]
@@ -327,7 +325,7 @@ def kinematic(car: CarParameters) -> Model:
     return Model("kinematic", car, ode, ("x", "y", "psi", "v", "delta"), ("a", "delta_rate"))
 
 
-MODELS: Final[dict[str, Callable[[CarParameters], Model]]] = {
+MODELS: Final[dict[str, Callable[[Car], Model]]] = {
     "dynamic": dynamic,
     "e_kinematic": e_kinematic,
     "kinematic": kinematic,

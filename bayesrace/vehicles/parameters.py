@@ -55,7 +55,7 @@ __all__ = [
     "ACTUATORS",
     "BODY",
     "DEFAULT_CAR",
-    "CarParameters",
+    "Car",
     "CarSetting",
     "builtin_cars",
     "car_text",
@@ -91,7 +91,7 @@ def _scales(known: Mapping[str, Any]) -> Scales:
     )
 
 
-class CarParameters(Part):
+class Car(Part):
     """One car; symbols as in docs/equations.md."""
 
     name: str = Field(
@@ -208,7 +208,7 @@ class CarParameters(Part):
             "brake_slow": slow * command,
         }
 
-    def on_tyres(self, model: str) -> "CarParameters":
+    def on_tyres(self, model: str) -> "Car":
         """The same car on tyres of this model: its own, or saturating ones in place of linear ones.
 
         InputError for linear tyres in place of others.
@@ -247,13 +247,13 @@ SECTIONS: Final[dict[str, tuple[str, ...]]] = {
     "tracks": ("train_track", "race_track"),
     "learning": ("mirrored_samples",),
 }
-"""Section of a car's file to the fields of CarParameters in it."""
+"""Section of a car's file to the fields of Car in it."""
 
 MODELS: Final[dict[str, dict[str, type[Part]]]] = {
     "tyres": {"pacejka": PacejkaTyres, "linear": LinearTyres},
     "drive": {"dc_motor": DcMotor, "acceleration": AccelerationDrive},
 }
-"""Section with a ``model``, a field of CarParameters as a whole, to what each model holds; a car on
+"""Section with a ``model``, a field of Car as a whole, to what each model holds; a car on
 unknown tyres lacks theirs."""
 
 _ORDER: Final = ("geometry", "tyres", "drive", "limits", "tracks", "learning")
@@ -268,30 +268,30 @@ _REMEDY: Final = f"'bayesrace cars {DEFAULT_CAR} --out FILE.toml' writes one to 
 
 
 @cache
-def builtin_cars() -> dict[str, CarParameters]:
+def builtin_cars() -> dict[str, Car]:
     """The cars in ``bayesrace/cars``, by name."""
     cars = [read_car(path) for path in sorted(_FOLDER.glob(f"*{_SUFFIX}"))]
     return {car.name: car for car in cars}
 
 
-def default_car() -> CarParameters:
+def default_car() -> Car:
     """The car that is meant where none is named."""
     return get_car(DEFAULT_CAR)
 
 
-def get_car(car: str | Path | CarParameters) -> CarParameters:
+def get_car(car: str | Path | Car) -> Car:
     """The built-in car of that name, or the car in that TOML file; a car is returned as it is.
 
     Raises InputError naming the built-in cars, or what is wrong with the file.
     """
-    if isinstance(car, CarParameters):
+    if isinstance(car, Car):
         return car
     if isinstance(car, Path) or car.endswith(_SUFFIX):
         return read_car(Path(car))
     return _builtin(car)
 
 
-def _builtin(name: str) -> CarParameters:
+def _builtin(name: str) -> Car:
     cars = builtin_cars()
     if name in cars:
         return cars[name]
@@ -301,7 +301,7 @@ def _builtin(name: str) -> CarParameters:
     )
 
 
-def described_car(description: object) -> CarParameters:
+def described_car(description: object) -> Car:
     """The car that settings, logs or samples describe: a built-in name, or all its values.
 
     ``description``: a name, or the values as mapping or as JSON text. It never names a file.
@@ -311,20 +311,20 @@ def described_car(description: object) -> CarParameters:
         if isinstance(description, str):
             if not description.startswith("{"):
                 return _builtin(description)
-            return CarParameters.model_validate_json(description)
-        return CarParameters.model_validate(description)
+            return Car.model_validate_json(description)
+        return Car.model_validate(description)
     except ValidationError as error:
-        faults = faults_in(error, "the car", CarParameters, _TAGS)
+        faults = faults_in(error, "the car", Car, _TAGS)
     raise InputError(f"the car described there is unusable: {faults}")
 
 
-def car_text(car: CarParameters) -> str:
+def car_text(car: Car) -> str:
     """What :func:`described_car` reads: the name of a built-in car, else all values as JSON."""
     return car.name if builtin_cars().get(car.name) == car else car.model_dump_json()
 
 
 CarSetting = Annotated[
-    CarParameters,
+    Car,
     BeforeValidator(lambda value: get_car(value) if isinstance(value, str | Path) else value),
     Field(description="car: built-in name or TOML file"),
     Option(default=DEFAULT_CAR),
@@ -332,7 +332,7 @@ CarSetting = Annotated[
 """Field of settings that accepts a name or a file and holds the whole car, as JSON does, too."""
 
 
-def read_car(path: Path | str) -> CarParameters:
+def read_car(path: Path | str) -> Car:
     """The car in a TOML file.
 
     Raises InputError, one line that names file, field, value and meaning of every fault.
@@ -347,8 +347,8 @@ def read_car(path: Path | str) -> CarParameters:
         values = form.model_validate(content).model_dump(exclude_unset=True)
         for section in SECTIONS:
             values |= values.pop(section, {})
-        form = CarParameters
-        return CarParameters.model_validate(values)
+        form = Car
+        return Car.model_validate(values)
     except ValidationError as error:
         faults = faults_in(error, "the file", form, _TAGS)
     except InputError as error:
@@ -360,7 +360,7 @@ def read_car(path: Path | str) -> CarParameters:
 def _form() -> type[Part]:
     """A car's file; its tuning is checked with the whole car, whose size it depends on."""
     fields: dict[str, Any] = {
-        name: (field.annotation, field) for name, field in CarParameters.model_fields.items()
+        name: (field.annotation, field) for name, field in Car.model_fields.items()
     }
     form = {name: fields[name] for name in ("name", *MODELS, "sensors")}
     for section, names in SECTIONS.items():
@@ -383,7 +383,7 @@ def _check_model(section: str, models: Collection[str], given: Any) -> None:
 
 def write_car(
     path: Path | str,
-    car: CarParameters,
+    car: Car,
     remarks: Sequence[str] = (),
     sensor_remarks: Mapping[str, Sequence[str]] = MappingProxyType({}),
 ) -> None:

@@ -34,7 +34,7 @@ from bayesrace.codegen.fmu.build import (
 from bayesrace.codegen.host_files import HEAD, IDENTITY_BYTES, WEIGHTS_FILE, weights_file
 from bayesrace.errors import InputError
 from bayesrace.files import replacing
-from bayesrace.gp.weights import GpWeights
+from bayesrace.gp.weights import Weights
 
 __all__ = ["exchange_weights", "licence_files", "pack", "third_parties"]
 
@@ -284,7 +284,7 @@ def _write(out: Path, contents: Mapping[str, bytes]) -> None:
         raise InputError(f"cannot write the FMU to {out}: {error.strerror}") from None
 
 
-def exchange_weights(fmu: Path, weights: GpWeights | None, out: Path) -> None:
+def exchange_weights(fmu: Path, weights: Weights | None, out: Path) -> None:
     """Writes ``fmu``, a controller's, with other weights to ``out`` (which may be ``fmu``).
 
     InputError if ``fmu`` is no controller's FMU, or the weights are for another model or have more

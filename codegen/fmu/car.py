@@ -18,7 +18,7 @@ from bayesrace.errors import InputError
 from bayesrace.integrators import PLANT_SCHEME, PLANT_SUBSTEP_HZ, SCHEMES
 from bayesrace.vehicles import models
 from bayesrace.vehicles.models import INPUTS, STATES
-from bayesrace.vehicles.parameters import CarParameters
+from bayesrace.vehicles.parameters import Car
 from bayesrace.vehicles.parts import LinearTyres, Pacejka
 
 __all__ = ["STATE", "car_fmu"]
@@ -51,13 +51,13 @@ _KIND: Final = {
 }
 
 
-def _title(car: CarParameters) -> str:
+def _title(car: Car) -> str:
     tyres = "linear" if isinstance(car.tyres, LinearTyres) else "Pacejka"
     drive = "an acceleration as drive command" if car.drive.guarded else "DC motor"
     return f"dynamic bicycle model with {tyres} tyres and {drive}"
 
 
-def _parameters(car: CarParameters, kind: str) -> list[Variable]:
+def _parameters(car: Car, kind: str) -> list[Variable]:
     """With bounds, unit and description of the car's own data model; limits for the guard only."""
     fields: dict[str, tuple[str, dict[str, Any]]] = {}  # axle, if it is of one, and schema
     for part in (car, car.true_tyres, car.drive):
@@ -72,9 +72,7 @@ def _parameters(car: CarParameters, kind: str) -> list[Variable]:
     return [_parameter(name, value, *fields[name], car) for name, value in values.items()]
 
 
-def _parameter(
-    name: str, value: float, axle: str, field: dict[str, Any], car: CarParameters
-) -> Variable:
+def _parameter(name: str, value: float, axle: str, field: dict[str, Any], car: Car) -> Variable:
     text, unit = re.fullmatch(r"(.*) \[([^]]*)\]", field["description"]).groups()  # type: ignore[union-attr]
     unit = {"command": car.drive.unit, "-": "1"}.get(unit, unit)
     return Variable(
@@ -89,7 +87,7 @@ def _parameter(
     )
 
 
-def _variables(car: CarParameters, kind: str) -> list[Variable]:
+def _variables(car: Car, kind: str) -> list[Variable]:
     """In the order that car.c relies on: states, inputs, parameters, the rest."""
     sampled = kind == "cs"
     held = " (held during a step)" if sampled else ""
@@ -120,7 +118,7 @@ def _variables(car: CarParameters, kind: str) -> list[Variable]:
     ]
 
 
-def _derivatives(car: CarParameters) -> list[Variable]:
+def _derivatives(car: Car) -> list[Variable]:
     """Their direct dependencies on states and inputs are those of the equations."""
     sparsity = _rates(car).sparsity_jac(0, 0)
     names = (*STATES, *INPUTS)
@@ -137,7 +135,7 @@ def _derivatives(car: CarParameters) -> list[Variable]:
     ]
 
 
-def _rates(car: CarParameters) -> Any:
+def _rates(car: Car) -> Any:
     """The equations as a function of states, inputs and parameters in one vector."""
     ode = models.dynamic_with_parameters(car)
     n, m, k = (ode.size1_in(i) for i in range(3))
@@ -145,7 +143,7 @@ def _rates(car: CarParameters) -> Any:
     return ca.Function("car_rates", [known], [ode(*ca.vertsplit(known, [0, n, n + m, n + m + k]))])
 
 
-def _substep(car: CarParameters) -> Any:
+def _substep(car: Car) -> Any:
     """One integration step of Co-Simulation: (x, u, p, h) -> x_next."""
     ode = models.dynamic_with_parameters(car)
     x, u, p = (ca.SX.sym(name, ode.size1_in(i)) for i, name in enumerate("xup"))
@@ -154,7 +152,7 @@ def _substep(car: CarParameters) -> Any:
     return ca.Function("car_substep", [x, u, p, h], [advance(lambda s: ode(s, u, p), x, h)])
 
 
-def _functions(car: CarParameters, kind: str) -> list[Any]:
+def _functions(car: Car, kind: str) -> list[Any]:
     if kind == "cs":
         return [_substep(car)]
     rates = _rates(car)
@@ -163,7 +161,7 @@ def _functions(car: CarParameters, kind: str) -> list[Any]:
     return [rates, ca.Function("car_forward", [known, seed], [forward])]
 
 
-def _sources(car: CarParameters, kind: str) -> dict[str, bytes]:
+def _sources(car: Car, kind: str) -> dict[str, bytes]:
     options: dict[str, Any] = {"with_header": True, "casadi_int": "int", "with_export": False}
     generator = ca.CodeGenerator("car_model.c", options)
     for function in _functions(car, kind):
@@ -175,7 +173,7 @@ def _sources(car: CarParameters, kind: str) -> dict[str, bytes]:
 
 
 def car_fmu(
-    car: CarParameters, version: Literal[2, 3] = 3, kind: Literal["cs", "me"] = "cs"
+    car: Car, version: Literal[2, 3] = 3, kind: Literal["cs", "me"] = "cs"
 ) -> FmuDefinition:
     """Definition of the car's FMU: Co-Simulation, or Model Exchange, which is FMI 3.0 only.
 

@@ -18,9 +18,9 @@ from bayesrace.codegen.fmu.car import STATE
 from bayesrace.codegen.fmu.readings import reading_inputs, reading_tables
 from bayesrace.codegen.host_files import PATH_FILE, WEIGHTS_FILE, path_file, weights_file
 from bayesrace.errors import InputError
-from bayesrace.gp.weights import GpWeights
+from bayesrace.gp.weights import Weights
 from bayesrace.manifest import Manifest, read_manifest
-from bayesrace.vehicles.parameters import CarParameters
+from bayesrace.vehicles.parameters import Car
 from bayesrace.vehicles.parts import Drive
 
 __all__ = ["controller_fmu"]
@@ -72,13 +72,13 @@ without a budget is never out of time."""
 
 def controller_fmu(
     artefact: Path,
-    car: CarParameters,
+    car: Car,
     *,
     rows: ArrayLike,
     spacing_m: float,
     settings: Mapping[str, float],
     fallback: Mapping[str, float],
-    weights: GpWeights | None = None,
+    weights: Weights | None = None,
     version: Literal[2, 3] = 3,
 ) -> FmuDefinition:
     """The controller of a built artefact on one racing line, ready for
@@ -115,7 +115,7 @@ def controller_fmu(
     )
 
 
-def _sources(artefact: Path, car: CarParameters, *, nominal: bool) -> dict[str, bytes]:
+def _sources(artefact: Path, car: Car, *, nominal: bool) -> dict[str, bytes]:
     """Of the artefact all but its clock: without one there are no budgets; two runs are equal."""
     own = {*artefact.glob("*.[ch]"), *(artefact / HOST).iterdir()} - {artefact / "br_clock.c"}
     files = {path.name: path for path in (NATIVE / "controller.c", *own, *artefact.glob("*.a"))}
@@ -134,7 +134,7 @@ def _value(values: Mapping[str, float], name: str) -> float:
 
 def _variables(
     manifest: Manifest,
-    car: CarParameters,
+    car: Car,
     settings: Mapping[str, float],
     fallback: Mapping[str, float],
 ) -> list[Variable]:
@@ -224,7 +224,7 @@ before; every doStep takes one of each instrument. Connect what acts, <code>d_ap
 """
 
 
-def _documentation(manifest: Manifest, car: CarParameters, weights: GpWeights | None) -> str:
+def _documentation(manifest: Manifest, car: Car, weights: Weights | None) -> str:
     correction = "no correction" if weights is None else f"weights '{escape(weights.version)}'"
     return f"""<p>Nonlinear model predictive controller, {manifest.horizon} stages of
 {manifest.step_s:g} s, model {escape(manifest.discretisation)}, {correction}. On x86-64 the binary

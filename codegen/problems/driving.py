@@ -26,7 +26,7 @@ from bayesrace.codegen.problems.problem import (
 )
 from bayesrace.integrators import Discretisation
 from bayesrace.vehicles.models import STATES, Model, top_command
-from bayesrace.vehicles.parameters import CarParameters
+from bayesrace.vehicles.parameters import Car
 
 __all__ = ["REFERENCE", "StateCost", "advance_function", "driving_problem", "linearise_function"]
 
@@ -46,7 +46,7 @@ REFERENCE = (
 )
 
 
-def _inputs(car: CarParameters, proximal: tuple[float, float]) -> tuple[Input, ...]:
+def _inputs(car: Car, proximal: tuple[float, float]) -> tuple[Input, ...]:
     effort = car.tuning.caution
     return (
         Input("d", car.drive.unit, limit=1e3, proximal=proximal[0], effort=effort.command),
@@ -62,7 +62,7 @@ def _inputs(car: CarParameters, proximal: tuple[float, float]) -> tuple[Input, .
     )
 
 
-def _parameters(car: CarParameters) -> tuple[Parameter, ...]:
+def _parameters(car: Car) -> tuple[Parameter, ...]:
     command, unit = car.drive.command, car.drive.unit
     per_square = car.drive.unit_per_square
     return (
@@ -80,7 +80,7 @@ def _parameters(car: CarParameters) -> tuple[Parameter, ...]:
     )
 
 
-def _states(car: CarParameters) -> tuple[State, ...]:
+def _states(car: Car) -> tuple[State, ...]:
     """With the sizes by which defects are measured, and the largest plausible values."""
     size, most, off = car.tuning.scale, car.tuning.plausible, car.tuning.caution
     odd = car.mirrored_samples
@@ -95,7 +95,7 @@ def _states(car: CarParameters) -> tuple[State, ...]:
     )
 
 
-def _constants(car: CarParameters) -> dict[str, float]:
+def _constants(car: Car) -> dict[str, float]:
     """What C is compiled with: sections of the car's tuning, and its wheelbase."""
     tuning = car.tuning
     sections = {

@@ -20,7 +20,7 @@ from bayesrace.controller.weights.checks import compare, slack_of
 from bayesrace.controller.weights.store import History, Store
 from bayesrace.errors import InputError
 from bayesrace.messages import Scalar
-from bayesrace.vehicles import CarParameters
+from bayesrace.vehicles import Car
 from bayesrace.vehicles.parts import GRAVITY_MPS2
 
 __all__ = ["Adoption", "Ruling", "Task", "Watch", "WeightsPort"]
@@ -38,7 +38,7 @@ class WeightsPort:
 
     artefact: Path
     step: NativeStep
-    car: CarParameters
+    car: Car
     history: History
     store: Store | None = None
 
@@ -68,7 +68,7 @@ class Ruling(NamedTuple):
 class Watch:
     """Looks between two cycles at what the compiled controller has found; see br_mpc_get_watch."""
 
-    def __init__(self, settings: GateSettings, car: CarParameters, step_s: float) -> None:
+    def __init__(self, settings: GateSettings, car: Car, step_s: float) -> None:
         self._settings, self.resolution = settings, slack_of(car, step_s)
         self._needed = settings.watch_s / step_s
         self._driven = self._judged = 0.0

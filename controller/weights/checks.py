@@ -22,11 +22,11 @@ from bayesrace.arrays import Floats
 from bayesrace.controller.native_step import NativeStep
 from bayesrace.controller.settings import WATCHED, GateSettings, MpcSettings
 from bayesrace.errors import InputError
-from bayesrace.gp.weights import FEATURES, OUTPUTS, UNITS, GpWeights, decode_weights, pack_weights
+from bayesrace.gp.weights import FEATURES, OUTPUTS, UNITS, Weights, decode_weights, pack_weights
 from bayesrace.messages import Scalar
 from bayesrace.processes import RUN_MODULE, die_with_parent
 from bayesrace.vehicles import described_car
-from bayesrace.vehicles.parameters import CarParameters
+from bayesrace.vehicles.parameters import Car
 from bayesrace.vehicles.parts import GRAVITY_MPS2
 
 __all__ = [
@@ -58,7 +58,7 @@ class Samples(NamedTuple):
 NO_SAMPLES: Final = Samples(np.zeros((0, 6)), *np.zeros((2, 0, 3)))
 
 
-def plausible_features(car: CarParameters, count: int) -> Floats:
+def plausible_features(car: Car, count: int) -> Floats:
     """Features (count, 6) over the whole range of the car, always the same ones."""
     vx, slip, turn, steer, push, rate = np.random.default_rng(5).uniform(-1, 1, (count, 6)).T
     vx = 0.5 * (vx + 1) * car.drive.top_speed_mps(car.d_max)
@@ -82,7 +82,7 @@ class Verdict(NamedTuple):
 class Checks:
     """The tests for one controller."""
 
-    def __init__(self, settings: GateSettings, artefact: Path, car: CarParameters) -> None:
+    def __init__(self, settings: GateSettings, artefact: Path, car: Car) -> None:
         self._settings, self._car = settings, car
         self._step = NativeStep(artefact, car, MpcSettings())
         self._step_s = self._step.manifest.step_s
@@ -133,7 +133,7 @@ class Checks:
         if not verdict.packed:
             raise InputError(verdict.text)
 
-    def _after(self, weights: GpWeights | None, features: Floats) -> Floats:
+    def _after(self, weights: Weights | None, features: Floats) -> Floats:
         """vx, vy, omega (n, 3) a step later, by the model that these weights correct; NaN where it
         has no value."""
         if weights is None:
@@ -147,18 +147,16 @@ class Checks:
                 row[:] = self._step.predict(x, u, self._step_s)[3:6]
         return found
 
-    def _mean(self, weights: GpWeights | None, features: Floats) -> Floats:
+    def _mean(self, weights: Weights | None, features: Floats) -> Floats:
         """The correction (n, 3) per step; NaN where a model has no value."""
         return self._after(weights, features) - self._after(None, features)
 
-    def _errors(self, weights: GpWeights | None, samples: Samples) -> Floats:
+    def _errors(self, weights: Weights | None, samples: Samples) -> Floats:
         """What is left of the residuals (n, 3); infinite where a model has no value."""
         left = samples.residuals - self._mean(weights, samples.features)
         return np.where(np.isfinite(left), left, np.inf)
 
-    def _check_origin(
-        self, weights: GpWeights, others: GpWeights | None, accepted_utc_ns: int
-    ) -> None:
+    def _check_origin(self, weights: Weights, others: Weights | None, accepted_utc_ns: int) -> None:
         made_ns, why_not = 0 if others is None else others.created_utc_ns, ""
         older_s = (min(made_ns, accepted_utc_ns or time.time_ns()) - weights.created_utc_ns) * 1e-9
         ahead_s = (weights.created_utc_ns - time.time_ns()) * 1e-9
@@ -174,7 +172,7 @@ class Checks:
         if why_not:
             raise InputError(f"weights '{weights.version}' are {why_not}")
 
-    def _check_bounds(self, new: GpWeights, recent: Samples) -> None:
+    def _check_bounds(self, new: Weights, recent: Samples) -> None:
         limit = np.array(self._car.tuning.gate.absurd)
         places = {
             "over the car's range": plausible_features(self._car, self._settings.plausible_states),
@@ -191,7 +189,7 @@ class Checks:
                     f"rad/s^2) by up to {worst}, and {most} is the most; train again"
                 )
 
-    def _check_own_samples(self, weights: GpWeights) -> None:
+    def _check_own_samples(self, weights: Weights) -> None:
         """The weights must predict the samples that they were learned from."""
         if not len(weights.sample_features):
             return
@@ -211,9 +209,9 @@ class Checks:
 
     def _compare(
         self,
-        new: GpWeights,
+        new: Weights,
         recent: Samples,
-        others: Iterable[GpWeights | None],
+        others: Iterable[Weights | None],
         facts: dict[str, Scalar],
     ) -> str:
         """What speaks for the weights, on recent samples; InputError if they are worse."""
@@ -236,7 +234,7 @@ class Checks:
         return found.text
 
 
-def _decoded(data: bytes) -> GpWeights | None:
+def _decoded(data: bytes) -> Weights | None:
     return decode_weights(data) if data else None
 
 
@@ -262,7 +260,7 @@ class Comparison(NamedTuple):
     """The number of ``samples``, and errors such as ``error_new_vx``."""
 
 
-def slack_of(car: CarParameters, step_s: float) -> Floats:
+def slack_of(car: Car, step_s: float) -> Floats:
     """What errors may differ by in any case (3,): the resolution of measurements."""
     return np.array(car.tuning.gate.resolution) * step_s
 

@@ -16,7 +16,7 @@ from bayesrace.plant.hardware import Hardware, Report
 from bayesrace.plant.process import main
 from bayesrace.plant.process_settings import PlantSettings
 from bayesrace.transport import Endpoints
-from bayesrace.vehicles import CarParameters, get_car
+from bayesrace.vehicles import Car, get_car
 
 POSE = struct.Struct("!4d")  # clock of the cameras [s], x, y [m], heading [rad]
 COMMAND = struct.Struct("!3d")  # drive command, steering angle [rad], to be reached at [rad/s]
@@ -28,7 +28,7 @@ COMMAND_S = 0.001  # from sending a command to its acting
 class MocapCar(Hardware):
     """Poses arrive at ``here``; commands go to ``there``."""
 
-    def __init__(self, car: CarParameters, here: tuple[str, int], there: tuple[str, int]) -> None:
+    def __init__(self, car: Car, here: tuple[str, int], there: tuple[str, int]) -> None:
         super().__init__(car, delays_s={"pose": DELAY_S}, command_s=COMMAND_S)
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.bind(here)

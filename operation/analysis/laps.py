@@ -18,7 +18,7 @@ from bayesrace.integrators import PLANT_SCHEME, PLANT_SUBSTEP_HZ, Discretisation
 from bayesrace.learning.sources import CYCLES, STATES, TRUE_STATES
 from bayesrace.messages import STATE, TELEMETRY, TRUTH, Topic
 from bayesrace.tracks import StartLine, Track
-from bayesrace.vehicles import CarParameters
+from bayesrace.vehicles import Car
 
 __all__ = [
     "Cycles",
@@ -142,7 +142,7 @@ def trajectory_digest(x: Floats, laps: LapTimes) -> str:
     return hashlib.sha256(states.astype("<f8", order="C").tobytes()).hexdigest()
 
 
-def positions_between(run: Trajectory, car: CarParameters) -> Floats | None:
+def positions_between(run: Trajectory, car: Car) -> Floats | None:
     """Positions (n - 1, m, 2) at the ends of the m sub-steps after each of the n samples.
 
     The built-in equations go through the same sub-steps again, from each logged state with the
@@ -159,7 +159,7 @@ def positions_between(run: Trajectory, car: CarParameters) -> Floats | None:
     return None if missed.max() > _SAME * car.wheelbase_m else places
 
 
-def _integrated(x: Floats, u: Floats, car: CarParameters, count: int) -> Floats:
+def _integrated(x: Floats, u: Floats, car: Car, count: int) -> Floats:
     """Positions (n, count, 2) after each sub-step from states (n, 7) with inputs (n, 2)."""
     import casadi as ca
 

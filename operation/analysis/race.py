@@ -46,7 +46,7 @@ from bayesrace.operation.analysis.results import (
 from bayesrace.raceline import RaceLine
 from bayesrace.tracks import PathProjection, Track
 from bayesrace.tracks.spline import CentrelineSearch, PlaneSpline
-from bayesrace.vehicles import CarParameters
+from bayesrace.vehicles import Car
 
 __all__ = ["DrivenRun", "RaceAnalysis", "read_race"]
 
@@ -78,7 +78,7 @@ class DrivenRun:
         record: RunRecord,
         track: Track,
         line: RaceLine,
-        car: CarParameters | None = None,
+        car: Car | None = None,
         *,
         whole: bool = False,
         number: int | None = None,

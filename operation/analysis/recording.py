@@ -20,7 +20,7 @@ from bayesrace.operation.analysis.laps import Trajectory
 from bayesrace.raceline import RaceLine, read_raceline
 from bayesrace.tracks import Track, read_track
 from bayesrace.transport import Numbering
-from bayesrace.vehicles import CarParameters, default_car, described_car
+from bayesrace.vehicles import Car, default_car, described_car
 
 __all__ = [
     "LIMIT_FILES",
@@ -208,9 +208,7 @@ class _Mpc(BaseModel):
 class RunSettings(BaseModel):
     """What is needed of a race's ``settings.json``, also of one that an earlier version wrote."""
 
-    car: Annotated[CarParameters, BeforeValidator(described_car)] = Field(
-        default_factory=default_car
-    )
+    car: Annotated[Car, BeforeValidator(described_car)] = Field(default_factory=default_car)
     track: str = "race"
     train_track: str = "train"
     mode: str = ""

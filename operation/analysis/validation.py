@@ -9,13 +9,13 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
-from bayesrace.gp.weights import GpWeights
+from bayesrace.gp.weights import Weights
 from bayesrace.learning.dataset import Dataset, left_out
 from bayesrace.learning.sources import read_samples
 from bayesrace.learning.validation import HORIZON, Validation, discretisation_of, mismatch, validate
 from bayesrace.operation.analysis.results import GpMetrics, gp_metrics
 from bayesrace.operation.terminal import UNCERTAIN
-from bayesrace.vehicles import CarParameters, get_car
+from bayesrace.vehicles import Car, get_car
 
 __all__ = ["DRIFTS", "HorizonResult", "Spread", "Validated", "ValidationResult", "validate_weights"]
 
@@ -83,12 +83,12 @@ class Validated:
 
 
 def validate_weights(
-    weights: GpWeights,
+    weights: Weights,
     drives: list[Path],
     name: str = "",
     runs: tuple[int, ...] | None = None,
     threshold: float = UNCERTAIN,
-    car: CarParameters | None = None,
+    car: Car | None = None,
     *,
     limits: bool = True,
 ) -> Validated:

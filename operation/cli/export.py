@@ -14,7 +14,7 @@ from bayesrace.trusted_files import trusted
 
 if TYPE_CHECKING:
     from bayesrace.codegen.settings import BuildSettings
-    from bayesrace.vehicles import CarParameters
+    from bayesrace.vehicles import Car
 
 __all__ = ["build", "export", "fmu"]
 
@@ -74,7 +74,7 @@ def export(
 
 
 def _controller(
-    car: "CarParameters",
+    car: "Car",
     track: str,
     raceline: Path | None,
     weights: Path | None,

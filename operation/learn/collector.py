@@ -16,7 +16,7 @@ from bayesrace.learning.sources import CYCLES, STATES, dataset_from_columns
 from bayesrace.messages import Actuation, State, Telemetry
 from bayesrace.operation.learn.records import LapRecord
 from bayesrace.tracks import StartLine, Track
-from bayesrace.vehicles.parameters import CarParameters
+from bayesrace.vehicles.parameters import Car
 
 __all__ = ["MOST_STATES", "Collector", "Stretch"]
 
@@ -73,7 +73,7 @@ class Collector:
 
     def __init__(
         self,
-        car: CarParameters,
+        car: Car,
         step_s: float,
         track: Track | None = None,
         every_s: float | None = None,

@@ -14,7 +14,7 @@ from pydantic import ValidationError
 
 from bayesrace.errors import InputError, faults_in
 from bayesrace.files import claimed, clear_partials, read_text, replacing, write_whole
-from bayesrace.gp.weights import OUTPUTS, GpWeights, write_weights
+from bayesrace.gp.weights import OUTPUTS, Weights, write_weights
 from bayesrace.learning.dataset import Dataset, concatenate
 from bayesrace.learning.sources import dataset_from_npz, write_npz
 from bayesrace.learning.subset import MOST_NEW, evenly
@@ -129,7 +129,7 @@ class Journal:
         return self._learning
 
     def add_update(
-        self, update: UpdateRecord, weights: GpWeights | None, kept: Dataset | None = None
+        self, update: UpdateRecord, weights: Weights | None, kept: Dataset | None = None
     ) -> None:
         """Adds an update with its weights in a file; new weights supersede those still pending.
 

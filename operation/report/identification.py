@@ -13,12 +13,12 @@ from bayesrace.operation.report.style import (
     look,
     write_png,
 )
-from bayesrace.vehicles import CarParameters
+from bayesrace.vehicles import Car
 
 __all__ = ["write_comparison"]
 
 
-def write_comparison(found: Comparison, car: CarParameters, path: Path) -> None:
+def write_comparison(found: Comparison, car: Car, path: Path) -> None:
     """Writes the figure as PNG: along the car over speed and over the command, and to its left."""
     unit, colour = car.drive.unit, look("bayesrace").colour
     over_speed = "along the car", "speed [m/s]", found.speed_mps, 0

@@ -14,7 +14,7 @@ from bayesrace.operation.analysis.race import DrivenRun
 from bayesrace.operation.report.style import INK, MUTED, look, panel
 from bayesrace.raceline import RaceLine
 from bayesrace.tracks import Track
-from bayesrace.vehicles import CarParameters
+from bayesrace.vehicles import Car
 from bayesrace.vehicles.parts import GRAVITY_MPS2
 
 __all__ = [
@@ -160,7 +160,7 @@ def time_figures(runs: Sequence[DrivenRun], track: Track) -> list[Figure]:
     return figures
 
 
-def input_figures(runs: Sequence[DrivenRun], track: Track, car: CarParameters) -> list[Figure]:
+def input_figures(runs: Sequence[DrivenRun], track: Track, car: Car) -> list[Figure]:
     """Drive command, steering angle and steering rate on the first lap, with the car's limits."""
     unit, angle, rate = car.drive.unit, car.delta_max_rad, car.delta_rate_max_radps
     command = f"d [{ ({'1': '–', 'm/s2': 'm/s²'}[unit]) }]"
@@ -176,7 +176,7 @@ def lap_figures(
     runs: Sequence[DrivenRun],
     track: Track,
     line: RaceLine,
-    car: CarParameters,
+    car: Car,
     friction: float | None,
 ) -> dict[str, list[Figure]]:
     """Panels with all laps, by the section of the report.

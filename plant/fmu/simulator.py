@@ -15,7 +15,7 @@ from bayesrace.plant.fmu.wiring import Wiring
 from bayesrace.plant.simulator import plant_discretisation
 from bayesrace.plant.vehicle import Command, Vehicle
 from bayesrace.vehicles.models import STATES
-from bayesrace.vehicles.parameters import CarParameters
+from bayesrace.vehicles.parameters import Car
 
 __all__ = ["FmuSimulator", "communication_step", "open_fmu"]
 
@@ -61,7 +61,7 @@ class FmuSimulator(Vehicle):
     """
 
     def __init__(
-        self, car: CarParameters, host: FmuHost, wiring: Wiring, *, period_s: float, part_s: float,
+        self, car: Car, host: FmuHost, wiring: Wiring, *, period_s: float, part_s: float,
         any_size: bool,
     ) -> None:  # fmt: skip
         """``part_s``: communication step; ``any_size``: other steps are as good."""
@@ -97,7 +97,7 @@ class FmuSimulator(Vehicle):
 
 @contextmanager
 def open_fmu(
-    car: CarParameters,
+    car: Car,
     path: str | os.PathLike[str],
     map_path: str | os.PathLike[str] | None = None,
     rate_hz: float = 50.0,

@@ -34,7 +34,7 @@ from bayesrace.operation.settings import PreparationSettings, RaceSettings
 from bayesrace.operation.terminal.terminal import stages_on
 from bayesrace.operation.training_drives import SOURCES
 from bayesrace.sensors import EXACT
-from bayesrace.vehicles import CarParameters
+from bayesrace.vehicles import Car
 
 __all__ = ["CONTROLLERS", "FAILED", "LEARNS_FROM", "PAPER", "Case", "Controller", "Files", "Row"]
 __all__ += ["car_identity", "factors", "run_case", "software_identity"]
@@ -91,8 +91,8 @@ def _fields(form: type[BaseModel], before: str) -> Iterator[tuple[str, FieldInfo
             yield before + name, field
 
 
-def car_identity(car: CarParameters) -> str:
-    """Name and digest of all its values; those of :attr:`CarParameters.identity` are fewer."""
+def car_identity(car: Car) -> str:
+    """Name and digest of all its values; those of :attr:`Car.identity` are fewer."""
     return f"{car.name}-{digest([car.model_dump_json()])}"
 
 

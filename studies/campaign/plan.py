@@ -34,7 +34,7 @@ from bayesrace.studies.campaign.case import (
 )
 from bayesrace.studies.settings import spread
 from bayesrace.tracks import builtin_tracks, is_random_track, load_track
-from bayesrace.vehicles import CarParameters, get_car
+from bayesrace.vehicles import Car, get_car
 
 __all__ = ["Campaign", "read_plan"]
 
@@ -94,7 +94,7 @@ class Campaign:
 
     cases: dict[str, Case]
     files: Files
-    cars: tuple[CarParameters, ...]
+    cars: tuple[Car, ...]
     text: str
 
 
@@ -119,7 +119,7 @@ class _Reader:
     def __init__(self, plan: _Plan, folder: Path) -> None:
         self._plan, self._folder = plan, folder
         self._files = Files()
-        self._cars: dict[str, CarParameters] = {}
+        self._cars: dict[str, Car] = {}
 
     def campaign(self, text: str) -> Campaign:
         plan = self._plan
@@ -196,7 +196,7 @@ class _Reader:
             raise InputError(f"{table}.{name}: {error}") from None
         return value
 
-    def _car(self, name: str) -> CarParameters:
+    def _car(self, name: str) -> Car:
         car = get_car(str(self._folder / name) if name.endswith(".toml") else name)
         if self._cars.setdefault(car.name, car) != car:
             raise InputError(f"two cars have the name '{car.name}'; give one of them another name")

@@ -26,7 +26,7 @@ from bayesrace.studies.campaign.campaign import computed
 from bayesrace.studies.campaign.case import FAILED, Case, Controller, Files, Row
 from bayesrace.studies.campaign.cluster import Remote, connected
 from bayesrace.studies.settings import TuneSettings
-from bayesrace.vehicles import CarParameters, write_car
+from bayesrace.vehicles import Car, write_car
 
 __all__ = ["Verdict", "print_verdict", "tune"]
 
@@ -127,14 +127,14 @@ def _finished(study: optuna.Study) -> int:
     return sum(trial.state.is_finished() for trial in study.get_trials(deepcopy=False))
 
 
-def _space(car: CarParameters) -> dict[str, BaseDistribution]:
+def _space(car: Car) -> dict[str, BaseDistribution]:
     """What a trial may propose."""
     spans = {name: FloatDistribution(*span, log=True) for name, span in _SPANS.items()}
     horizons = CategoricalDistribution(sorted({*_HORIZONS, car.tuning.objective.horizon}))
     return {**spans, "friction": _FRICTION, "horizon": horizons}
 
 
-def tuned_car(car: CarParameters, params: Mapping[str, Any]) -> CarParameters:
+def tuned_car(car: Car, params: Mapping[str, Any]) -> Car:
     """The car with what a trial proposes, in multiples of its own values."""
     own = car.tuning.objective
     changed = {name: float(f"{params[name] * getattr(own, name):.4g}") for name in _SPANS}
@@ -145,7 +145,7 @@ def tuned_car(car: CarParameters, params: Mapping[str, Any]) -> CarParameters:
 
 
 def _driven(
-    cars: Sequence[CarParameters], client: Client, files: Files, tracks: Sequence[str], weights: str
+    cars: Sequence[Car], client: Client, files: Files, tracks: Sequence[str], weights: str
 ) -> pd.DataFrame:
     """A row for each ``car`` by its number, ``track`` and ``controller``.
 

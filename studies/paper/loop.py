@@ -33,7 +33,7 @@ from bayesrace.studies.paper.experiment import (
 from bayesrace.tracks import Track
 from bayesrace.tracks.spline import fit_arc_length
 from bayesrace.tracks.tables import read_table
-from bayesrace.vehicles import CarParameters
+from bayesrace.vehicles import Car
 from bayesrace.vehicles.models import dynamic
 from bayesrace.vehicles.parts import GRAVITY_MPS2
 
@@ -208,7 +208,7 @@ def _is_ethz(track: Track) -> bool:
     return abs(track.length_m - _ETHZ_M) < 0.1
 
 
-def published_line(path: Path, track: Track, car: CarParameters) -> RaceLine:
+def published_line(path: Path, track: Track, car: Car) -> RaceLine:
     """The line of a published file, closed: its first lap, from standstill, with its speeds.
 
     Where the file drives on beyond a lap, at speed, the closed line has the speeds of that second

@@ -31,7 +31,7 @@ from bayesrace.operation.terminal.terminal import Stage, Stages
 from bayesrace.studies.paper.experiment import GP, Figures, Finding, Section, at_most, stored
 from bayesrace.studies.paper.loop import LIMITS, course
 from bayesrace.tracks import Track
-from bayesrace.vehicles import CarParameters
+from bayesrace.vehicles import Car
 from bayesrace.vehicles.models import Model, dynamic, e_kinematic, kinematic
 from bayesrace.vehicles.parts import AccelerationDrive
 
@@ -85,7 +85,7 @@ _OTHERS: Final = (
 )
 
 
-def model_section(car: CarParameters) -> Section:
+def model_section(car: Car) -> Section:
     """All three from rest; the drive's force over mass is the same in each."""
     # A drive whose command is F_r,x / m, resistances included.
     drive = AccelerationDrive(model="acceleration", power_speed_mps=1e3, speed_max_mps=1e3)

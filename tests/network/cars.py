@@ -13,7 +13,7 @@ import numpy as np
 
 from bayesrace.codegen.build import build
 from bayesrace.codegen.settings import BuildSettings
-from bayesrace.gp.weights import GpWeights, write_weights
+from bayesrace.gp.weights import Weights, write_weights
 from bayesrace.raceline.line import RaceLine, write_raceline
 from bayesrace.tracks import Track, write_track
 from bayesrace.vehicles import get_car
@@ -72,7 +72,7 @@ def gentle_course(
 
 
 @functools.cache
-def _weights() -> GpWeights:
+def _weights() -> Weights:
     """Without, the car would snake from 1.4 m/s on."""
     return fit_weights(get_car("orca"), ("rbf", "matern25", "matern15"))
 

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from bayesrace.gp.weights import GpWeights, read_weights
-from bayesrace.vehicles import CarParameters
+from bayesrace.gp.weights import Weights, read_weights
+from bayesrace.vehicles import Car
 from tests.conftest import fit_weights
 from tests.network.cars import Course
 from tests.takeover.rig import KINDS, Rig, make_course, rigged
@@ -20,13 +20,13 @@ def course(tmp_path_factory: pytest.TempPathFactory) -> Course:
 
 
 @pytest.fixture(scope="session")
-def good(course: Course) -> GpWeights:
+def good(course: Course) -> Weights:
     """What the controllers are started with."""
     return read_weights(course.weights_file)
 
 
 @pytest.fixture(scope="session")
-def again(car: CarParameters) -> GpWeights:
+def again(car: Car) -> Weights:
     """As good, learned from another drive."""
     return replace(fit_weights(car, KINDS, count=300, seed=2), version="again")
 

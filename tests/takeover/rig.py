@@ -15,7 +15,7 @@ from msgspec.structs import replace
 
 from bayesrace.codegen.build import build
 from bayesrace.codegen.settings import BuildSettings
-from bayesrace.gp.weights import GpWeights, encode_weights, write_weights
+from bayesrace.gp.weights import Weights, encode_weights, write_weights
 from bayesrace.log import LogReader
 from bayesrace.messages import EVENT, STATE, TELEMETRY, Event, State, car_key, decode
 from bayesrace.operation.drive import RunPlan, run_request
@@ -79,11 +79,11 @@ class Rig:
         self.start(run, seconds=seconds)
         return self.director.wait_for_end(run, 60.0)
 
-    def send(self, weights: GpWeights) -> dict[str, Any]:
+    def send(self, weights: Weights) -> dict[str, Any]:
         """Data of the answer."""
         return dict(self.director.send_weights(encode_weights(weights)).data)
 
-    def drive_and_send(self, run: int, weights: GpWeights, seconds: float) -> list[int]:
+    def drive_and_send(self, run: int, weights: Weights, seconds: float) -> list[int]:
         """In lockstep, sending weights twice; the cycles that the answers name."""
         self.start(run, seconds=seconds)
         cycles = [self.send(weights)["cycle"] for _ in range(2)]

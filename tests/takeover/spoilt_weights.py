@@ -6,7 +6,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from bayesrace.gp.weights import GpOutput, GpWeights
+from bayesrace.gp.weights import GpOutput, Weights
 
 __all__ = ["SPOILT", "spoilt"]
 
@@ -39,7 +39,7 @@ SPOILT: Final[dict[str, Callable[[Outputs], Outputs]]] = {
 """What is done to vx, vy, omega."""
 
 
-def spoilt(weights: GpWeights, what: str) -> GpWeights:
+def spoilt(weights: Weights, what: str) -> Weights:
     """The same, spoilt, under a name that says so, and without the samples that would tell."""
     version = f"{weights.version}-{what.replace(' ', '-')}"
     none: Any = {"sample_features": np.zeros((0, 6)), "sample_residuals": np.zeros((0, 3))}

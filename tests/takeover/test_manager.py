@@ -23,7 +23,7 @@ from bayesrace.controller.assembly import PredictiveController, predictive_contr
 from bayesrace.controller.settings import GateSettings
 from bayesrace.controller.weights.adoption import Ruling
 from bayesrace.controller.weights.manager import WeightUpdateManager
-from bayesrace.gp.weights import GpWeights, encode_weights
+from bayesrace.gp.weights import Weights, encode_weights
 from bayesrace.messages import ROLLBACK, WEIGHTS, Reply, RollbackRequest
 from bayesrace.operation.learn.publishing import in_words
 from bayesrace.transport import Endpoints, ask, open_session
@@ -65,7 +65,7 @@ class Bench:
             self._seq += 1
             self.adoption.observe(0.0, fallen_back)
 
-    def send(self, weights: GpWeights) -> "Future[Reply]":
+    def send(self, weights: Weights) -> "Future[Reply]":
         return self._pool.submit(ask, self._session, WEIGHTS, CAR, encode_weights(weights))
 
     def roll_back(self) -> "Future[Reply]":
@@ -82,7 +82,7 @@ class Bench:
         until(answered, "an answer", 60.0)
         return answer.result()
 
-    def accept(self, weights: GpWeights) -> Reply:
+    def accept(self, weights: Weights) -> Reply:
         reply = self.reply(self.send(weights))
         assert reply.accepted, reply.text
         return reply
@@ -136,7 +136,7 @@ def bench(
 
 
 def test_an_offer_that_the_control_loop_does_not_adopt_is_withdrawn(
-    course: Course, good: GpWeights, again: GpWeights, monkeypatch: pytest.MonkeyPatch
+    course: Course, good: Weights, again: Weights, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("bayesrace.controller.weights.manager._TASK_S", 0.1)
     with bench(course) as made:
@@ -151,7 +151,7 @@ def test_an_offer_that_the_control_loop_does_not_adopt_is_withdrawn(
 
 
 def test_a_request_when_too_many_wait_is_refused_for_now(
-    course: Course, again: GpWeights, monkeypatch: pytest.MonkeyPatch
+    course: Course, again: Weights, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("bayesrace.controller.weights.manager._MOST_WAITING", 1)
     with bench(course) as made:
@@ -166,7 +166,7 @@ def test_a_request_when_too_many_wait_is_refused_for_now(
 
 
 def test_every_refusal_is_counted(
-    course: Course, again: GpWeights, monkeypatch: pytest.MonkeyPatch
+    course: Course, again: Weights, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """By a full queue, and by a fault of the controller's own."""
     monkeypatch.setattr("bayesrace.controller.weights.manager._MOST_WAITING", 1)
@@ -189,7 +189,7 @@ def test_every_refusal_is_counted(
 
 
 def test_a_check_that_hangs_is_killed_by_its_deadline(
-    course: Course, good: GpWeights, again: GpWeights, monkeypatch: pytest.MonkeyPatch
+    course: Course, good: Weights, again: Weights, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The request is refused for now, what is in use stays, and the next one is served."""
     with bench(course) as made:
@@ -218,9 +218,7 @@ FAIL = "import sys; sys.stdin.buffer.read(); print('no memory', file=sys.stderr)
 # Requests and the watch ----------------------------------------------------------------------
 
 
-def test_requests_while_the_watch_goes_back(
-    course: Course, good: GpWeights, again: GpWeights
-) -> None:
+def test_requests_while_the_watch_goes_back(course: Course, good: Weights, again: Weights) -> None:
     """One step back is made, not two; weights that have been judged beside those that are rolled
     back are not adopted; and what the watch has rolled back is not accepted again."""
     with bench(course) as made:
@@ -246,7 +244,7 @@ def test_requests_while_the_watch_goes_back(
 
 @pytest.mark.parametrize("proven", [True, False])
 def test_back_to_weights_that_were_never_proven(
-    course: Course, good: GpWeights, again: GpWeights, proven: bool
+    course: Course, good: Weights, again: Weights, proven: bool
 ) -> None:
     """The watch over them goes back to what was proven before them."""
     gate = GateSettings(watch_s=10.0)
@@ -267,7 +265,7 @@ def test_back_to_weights_that_were_never_proven(
 
 
 def test_a_full_disk_does_not_stop_an_adoption(
-    tmp_path: Path, course: Course, good: GpWeights, again: GpWeights
+    tmp_path: Path, course: Course, good: Weights, again: Weights
 ) -> None:
     """The answer says that weights are not kept; they are as soon as there is room."""
     with bench(course, store=tmp_path / "store") as made:
@@ -289,7 +287,7 @@ def test_a_full_disk_does_not_stop_an_adoption(
 
 
 def test_a_store_that_has_vanished_does_not_stop_the_watch(
-    tmp_path: Path, course: Course, good: GpWeights, again: GpWeights
+    tmp_path: Path, course: Course, good: Weights, again: Weights
 ) -> None:
     store = tmp_path / "store"
     with bench(course, store=store) as made:

@@ -7,12 +7,12 @@ import pytest
 from bayesrace.controller.weights.store import HISTORY, AcceptedWeights, History, Store, digest_of
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import encode_weights, pack_weights, zero_weights
-from bayesrace.vehicles import CarParameters
+from bayesrace.vehicles import Car
 
 START = AcceptedWeights(number=0, version="", digest=digest_of(b""), proven=True)
 
 
-def history(car: CarParameters, *proven: bool) -> History:
+def history(car: Car, *proven: bool) -> History:
     """Weights that have been accepted one after the other, after those at the start."""
     made = History(discretisation="d", entries=[START])
     for one in proven:
@@ -26,7 +26,7 @@ def numbers(folder: Path) -> list[int]:
     return [one.number for one in Store(folder, "d").restore(START).entries]
 
 
-def test_what_is_kept_is_found_again(tmp_path: Path, car: CarParameters) -> None:
+def test_what_is_kept_is_found_again(tmp_path: Path, car: Car) -> None:
     folder = tmp_path / "new" / "store"
     store = Store(folder, "d")
     assert store.restore(START).entries == [START]
@@ -42,7 +42,7 @@ def test_what_is_kept_is_found_again(tmp_path: Path, car: CarParameters) -> None
     assert len(list(folder.iterdir())) == 2
 
 
-def test_the_store_keeps_the_newest_and_a_proven_one(tmp_path: Path, car: CarParameters) -> None:
+def test_the_store_keeps_the_newest_and_a_proven_one(tmp_path: Path, car: Car) -> None:
     kept = history(car, *(number == 2 for number in range(1, 15)))
     Store(tmp_path, "d").keep(kept)
     assert numbers(tmp_path) == [0, 2, *range(15 - HISTORY, 15)]
@@ -50,9 +50,7 @@ def test_the_store_keeps_the_newest_and_a_proven_one(tmp_path: Path, car: CarPar
     assert len(list(tmp_path.glob("*.bin"))) == HISTORY + 1
 
 
-def test_a_store_of_another_model_or_a_damaged_one_is_refused(
-    tmp_path: Path, car: CarParameters
-) -> None:
+def test_a_store_of_another_model_or_a_damaged_one_is_refused(tmp_path: Path, car: Car) -> None:
     Store(tmp_path, "d").keep(history(car, True))
     with pytest.raises(InputError, match="weights for d, not for e; choose another folder"):
         Store(tmp_path, "e")
@@ -65,7 +63,7 @@ def test_a_store_of_another_model_or_a_damaged_one_is_refused(
         Store(tmp_path / "file", "d")
 
 
-def test_a_damaged_file_is_left_out(tmp_path: Path, car: CarParameters) -> None:
+def test_a_damaged_file_is_left_out(tmp_path: Path, car: Car) -> None:
     Store(tmp_path, "d").keep(history(car, True, True))
     newest = max(tmp_path.glob("*.bin"))
     newest.write_bytes(newest.read_bytes()[:-1])

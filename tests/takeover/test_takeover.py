@@ -21,7 +21,7 @@ from bayesrace.controller.assembly import predictive_controller
 from bayesrace.controller.cycle import Cycle
 from bayesrace.controller.driver import Decision
 from bayesrace.controller.process_settings import ControllerSettings
-from bayesrace.gp.weights import GpWeights, encode_weights, write_weights, zero_weights
+from bayesrace.gp.weights import Weights, encode_weights, write_weights, zero_weights
 from bayesrace.messages import ACTUATION, State
 from bayesrace.transport import Director, Endpoints, free_endpoint, open_session, send_rollback
 from bayesrace.vehicles import get_car
@@ -37,7 +37,7 @@ CAR = get_car("orca")
 # Lockstep ------------------------------------------------------------------------------------
 
 
-def test_adopting_the_same_weights_changes_no_bit(rig: Rig, good: GpWeights) -> None:
+def test_adopting_the_same_weights_changes_no_bit(rig: Rig, good: Weights) -> None:
     long_s = 60.0  # a check takes a second
     rig.drive(1, seconds=long_s)
     for number in range(1, 4):
@@ -58,7 +58,7 @@ def test_adopting_the_same_weights_changes_no_bit(rig: Rig, good: GpWeights) -> 
     assert rig.counters()["weights_accepted"] == taken
 
 
-def replayed(course: Course, states: Sequence[State], weights: Mapping[int, GpWeights]) -> Floats:
+def replayed(course: Course, states: Sequence[State], weights: Mapping[int, Weights]) -> Floats:
     """Inputs (n, 2) of a controller that answers these states of a lockstep run, one by one.
 
     ``weights``: new ones, by the index of the first state that they answer.
@@ -84,7 +84,7 @@ def replayed(course: Course, states: Sequence[State], weights: Mapping[int, GpWe
 
 
 def test_inputs_jump_by_what_the_new_model_explains(
-    rig: Rig, course: Course, again: GpWeights
+    rig: Rig, course: Course, again: Weights
 ) -> None:
     """To rounding: the plan goes on, and nothing else of the controller is changed."""
     rig.start(1, seconds=60.0)
@@ -108,7 +108,7 @@ def test_inputs_jump_by_what_the_new_model_explains(
 
 
 def test_where_going_back_is_no_better_the_car_slows_down_and_says_so(
-    tmp_path: Path, course: Course, good: GpWeights
+    tmp_path: Path, course: Course, good: Weights
 ) -> None:
     """At speed, no correction, as at the start, is worse than one that errs in vx alone."""
     start, gate, mpc = (tmp_path / name for name in ("none.bin", "gate.json", "mpc.json"))
@@ -137,7 +137,7 @@ def test_where_going_back_is_no_better_the_car_slows_down_and_says_so(
 
 
 def test_the_event_says_what_a_lap_loses_where_weights_do_not_know_the_car(
-    rig: Rig, good: GpWeights
+    rig: Rig, good: Weights
 ) -> None:
     lost_s = rig.send(spoilt(good, "flip vx"))["unknown_s"]
     assert lost_s > 0.1
@@ -153,7 +153,7 @@ QUICK = ("flip all", "swap vy omega")
     [*QUICK, *(pytest.param(one, marks=pytest.mark.check) for one in SPOILT if one not in QUICK)],
 )
 def test_spoilt_weights_never_take_the_car_off_its_track(
-    rig: Rig, good: GpWeights, what: str
+    rig: Rig, good: Weights, what: str
 ) -> None:
     """Without a sample they are adopted, and rolled back; with samples they are refused."""
     absurd = what == "swap vy omega"  # one of them is ten times the other
@@ -181,7 +181,7 @@ def test_spoilt_weights_never_take_the_car_off_its_track(
 
 @pytest.mark.check
 def test_two_rollbacks_by_the_watch_are_equal_to_the_bit(
-    tmp_path: Path, course: Course, good: GpWeights
+    tmp_path: Path, course: Course, good: Weights
 ) -> None:
     found = []
     for _ in range(2):
@@ -193,7 +193,7 @@ def test_two_rollbacks_by_the_watch_are_equal_to_the_bit(
     assert found[0] == found[1]
 
 
-def test_what_is_no_weights_file_is_refused(rig: Rig, good: GpWeights) -> None:
+def test_what_is_no_weights_file_is_refused(rig: Rig, good: Weights) -> None:
     data = encode_weights(good)
     spoilt_at = len(data) // 2
     corrupt = data[:spoilt_at] + bytes([data[spoilt_at] ^ 1]) + data[spoilt_at + 1 :]
@@ -215,7 +215,7 @@ def test_what_is_no_weights_file_is_refused(rig: Rig, good: GpWeights) -> None:
     assert rig.status().weights_version == good.version
 
 
-def test_back_and_back_to_the_start(rig: Rig, good: GpWeights) -> None:
+def test_back_and_back_to_the_start(rig: Rig, good: Weights) -> None:
     for version in ("one", "two"):
         rig.send(replace(good, version=version))
     data = send_rollback(rig.session, "orca", "the test says so").data
@@ -238,7 +238,7 @@ def test_back_and_back_to_the_start(rig: Rig, good: GpWeights) -> None:
 
 
 @pytest.mark.check
-def test_spoilt_weights_are_rolled_back_in_real_time(rig: Rig, good: GpWeights) -> None:
+def test_spoilt_weights_are_rolled_back_in_real_time(rig: Rig, good: Weights) -> None:
     rig.send(spoilt(good, "flip all"))
     rig.start(1, lockstep=False, seconds=DRIVEN_S)
     end = rig.director.wait_for_end(1, 60.0)
@@ -248,7 +248,7 @@ def test_spoilt_weights_are_rolled_back_in_real_time(rig: Rig, good: GpWeights) 
 
 
 @pytest.mark.check
-def test_two_publishers_at_once_leave_one_order(rig: Rig, good: GpWeights) -> None:
+def test_two_publishers_at_once_leave_one_order(rig: Rig, good: Weights) -> None:
     rig.start(1, lockstep=False, seconds=DRIVEN_S)
     answers: list[dict[str, Any]] = []
 
@@ -275,7 +275,7 @@ def test_two_publishers_at_once_leave_one_order(rig: Rig, good: GpWeights) -> No
 # Processes that end ---------------------------------------------------------------------------
 
 
-def test_a_check_that_is_killed_does_not_touch_the_drive(rig: Rig, good: GpWeights) -> None:
+def test_a_check_that_is_killed_does_not_touch_the_drive(rig: Rig, good: Weights) -> None:
     """The request is refused, and the drive is the same, to the bit, as one undisturbed."""
     rig.drive(1, seconds=10.0)
     rig.start(2, seconds=600.0)
@@ -297,9 +297,7 @@ def test_a_check_that_is_killed_does_not_touch_the_drive(rig: Rig, good: GpWeigh
     assert rig.off_track_m(1) < 0.0
 
 
-def test_accepted_weights_survive_a_restart(
-    tmp_path: Path, course: Course, good: GpWeights
-) -> None:
+def test_accepted_weights_survive_a_restart(tmp_path: Path, course: Course, good: Weights) -> None:
     """Killed right after the answer; another --weights does not matter any more."""
     store = str(tmp_path / "store")
     at_plant, at_controller = free_endpoint(), free_endpoint()

@@ -16,8 +16,8 @@ from bayesrace.controller.assembly import make_path_table
 from bayesrace.controller.native_step import NativeStep
 from bayesrace.controller.settings import SAMPLES, WATCHED, GateSettings, MpcSettings
 from bayesrace.controller.weights.adoption import Ruling, Watch
-from bayesrace.gp.weights import GpWeights, pack_weights, zero_weights
-from bayesrace.vehicles import CarParameters
+from bayesrace.gp.weights import Weights, pack_weights, zero_weights
+from bayesrace.vehicles import Car
 from tests.conftest import Circuit, fit_weights, smooth_drive
 from tests.takeover.rig import KINDS
 from tests.takeover.spoilt_weights import SPOILT, spoilt
@@ -31,18 +31,18 @@ Drive = tuple[Floats, Floats]
 
 
 @pytest.fixture(scope="module")
-def drive(car: CarParameters) -> Drive:
+def drive(car: Car) -> Drive:
     """States (601, 7) and inputs of a drive that nothing here was learned from."""
     return smooth_drive(car, 601, seed=7)
 
 
 @pytest.fixture(scope="module")
-def honest(car: CarParameters) -> GpWeights:
+def honest(car: Car) -> Weights:
     return fit_weights(car, KINDS, count=300, seed=1)
 
 
 @pytest.fixture
-def step(kinematic_artefact: Path, car: CarParameters, circuit: Circuit) -> NativeStep:
+def step(kinematic_artefact: Path, car: Car, circuit: Circuit) -> NativeStep:
     """One that has been stepped, as it is between two cycles."""
     native = NativeStep(kinematic_artefact, car, MpcSettings())
     spacing_m = car.tuning.path.spacing_m
@@ -51,7 +51,7 @@ def step(kinematic_artefact: Path, car: CarParameters, circuit: Circuit) -> Nati
     return native
 
 
-def adopt(step: NativeStep, new: GpWeights) -> None:
+def adopt(step: NativeStep, new: Weights) -> None:
     packed = pack_weights(new)
     step.stage_weights(packed)
     step.adopt_weights()
@@ -69,7 +69,7 @@ def show(
 
 
 def watched(
-    step: NativeStep, car: CarParameters, drive: Drive, new: GpWeights, old: GpWeights,
+    step: NativeStep, car: Car, drive: Drive, new: Weights, old: Weights,
     before: int = 0,
 ) -> list[tuple[int, Ruling]]:  # fmt: skip
     """What the watch finds, after how many samples, up to a rollback or to the proof; so many
@@ -89,7 +89,7 @@ def watched(
 
 
 def test_the_errors_are_those_of_the_weights(
-    step: NativeStep, drive: Drive, honest: GpWeights, again: GpWeights, car: CarParameters
+    step: NativeStep, drive: Drive, honest: Weights, again: Weights, car: Car
 ) -> None:
     """Against the residuals and the posterior means, each computed on its own."""
     reference = fit_weights(car, KINDS, count=600, seed=7)
@@ -109,7 +109,7 @@ def test_the_errors_are_those_of_the_weights(
 
 
 def test_what_noise_explains_is_no_error(
-    step: NativeStep, drive: Drive, honest: GpWeights, again: GpWeights, car: CarParameters
+    step: NativeStep, drive: Drive, honest: Weights, again: Weights, car: Car
 ) -> None:
     """Against the formula: each square less the noise, by 1 / (1 + noise / resolution^2)."""
     noise = np.random.default_rng(2).uniform(0, 4e-5, (90, 7))
@@ -129,7 +129,7 @@ def test_what_noise_explains_is_no_error(
 
 
 def test_states_are_estimated_by_the_proven_weights_while_others_are_watched(
-    step: NativeStep, drive: Drive, honest: GpWeights, again: GpWeights
+    step: NativeStep, drive: Drive, honest: Weights, again: Weights
 ) -> None:
     v = np.concatenate([drive[0][100], drive[1][100]])
 
@@ -151,7 +151,7 @@ def test_states_are_estimated_by_the_proven_weights_while_others_are_watched(
     assert believed() == found[1]
 
 
-def test_the_newest_samples_are_kept(step: NativeStep, drive: Drive, honest: GpWeights) -> None:
+def test_the_newest_samples_are_kept(step: NativeStep, drive: Drive, honest: Weights) -> None:
     list(show(step, drive))
     features, _, _ = step.samples()
     assert len(features) == SAMPLES
@@ -165,7 +165,7 @@ def test_the_newest_samples_are_kept(step: NativeStep, drive: Drive, honest: GpW
 
 
 def test_the_watch_keeps_honest_weights(
-    step: NativeStep, drive: Drive, honest: GpWeights, again: GpWeights, car: CarParameters
+    step: NativeStep, drive: Drive, honest: Weights, again: Weights, car: Car
 ) -> None:
     none = zero_weights(honest.car, honest.discretisation)
     for new, old in ((honest, none), (again, none), (honest, again), (honest, honest)):
@@ -176,7 +176,7 @@ def test_the_watch_keeps_honest_weights(
 
 @pytest.mark.parametrize("what", SPOILT)
 def test_the_watch_rolls_spoilt_weights_back(
-    step: NativeStep, drive: Drive, honest: GpWeights, again: GpWeights, car: CarParameters,
+    step: NativeStep, drive: Drive, honest: Weights, again: Weights, car: Car,
     what: str,
 ) -> None:  # fmt: skip
     ((count, ruling),) = watched(step, car, drive, spoilt(again, what), honest)
@@ -185,7 +185,7 @@ def test_the_watch_rolls_spoilt_weights_back(
 
 
 def test_the_watch_goes_back_only_to_what_is_no_worse(
-    step: NativeStep, drive: Drive, honest: GpWeights, again: GpWeights, car: CarParameters
+    step: NativeStep, drive: Drive, honest: Weights, again: Weights, car: Car
 ) -> None:
     """Wrong in vx alone, weights are still better than none: the car slows down, once, and they
     are never proven."""
@@ -198,7 +198,7 @@ def test_the_watch_goes_back_only_to_what_is_no_worse(
 
 
 def test_the_watch_rolls_back_what_leaves_no_solution(
-    step: NativeStep, honest: GpWeights, car: CarParameters
+    step: NativeStep, honest: Weights, car: Car
 ) -> None:
     """A car that stands has no error by which weights could be judged."""
     adopt(step, honest)
@@ -211,7 +211,7 @@ def test_the_watch_rolls_back_what_leaves_no_solution(
 
 
 def test_going_back_restores_the_proven_weights_to_the_bit(
-    step: NativeStep, drive: Drive, honest: GpWeights, again: GpWeights
+    step: NativeStep, drive: Drive, honest: Weights, again: Weights
 ) -> None:
     """Also where others have been adopted, and staged, in the meantime."""
     x, u = drive[0][100], drive[1][100]

@@ -14,7 +14,7 @@ from bayesrace.arrays import Floats
 from bayesrace.controller.assembly import compiled_controller
 from bayesrace.controller.settings import GateSettings
 from bayesrace.controller.weights.checks import Checks, Samples
-from bayesrace.gp.weights import GpWeights, encode_weights, read_weights
+from bayesrace.gp.weights import Weights, encode_weights, read_weights
 from bayesrace.integrators import PREDICTION
 from bayesrace.learning.dataset import Dataset
 from bayesrace.learning.validation import residual
@@ -35,7 +35,7 @@ NOISES = pytest.mark.parametrize("noise", [(0.5, 0.2), (1.0, 0.5)], ids=["0.5 mm
 
 
 @cache
-def updated() -> GpWeights:
+def updated() -> Weights:
     """Learned from the training drive and a drive of the first weights, whose states are known."""
     files = prepared()
     assert files.training is not None

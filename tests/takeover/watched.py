@@ -11,13 +11,13 @@ from bayesrace.controller.interface import Environment
 from bayesrace.controller.settings import GateSettings
 from bayesrace.controller.weights.adoption import Adoption, Ruling
 from bayesrace.controller.weights.checks import Checks
-from bayesrace.gp.weights import GpWeights, encode_weights, pack_weights, zero_weights
+from bayesrace.gp.weights import Weights, encode_weights, pack_weights, zero_weights
 from bayesrace.messages import State
 from bayesrace.operation.closed_loop import ClosedLoop
 from bayesrace.raceline import racing_line
 from bayesrace.sensors import EXACT, Sensors
 from bayesrace.tracks import load_track
-from bayesrace.vehicles import CarParameters
+from bayesrace.vehicles import Car
 
 __all__ = ["Course"]
 
@@ -37,18 +37,14 @@ class WatchedLoop(ClosedLoop):
 class Course:
     """A car on a track, and the checks of its controller."""
 
-    def __init__(
-        self, car: CarParameters, track: str, seconds: float, sensors: Sensors = EXACT
-    ) -> None:
+    def __init__(self, car: Car, track: str, seconds: float, sensors: Sensors = EXACT) -> None:
         self._car, self._seconds, self._sensors = car, seconds, sensors
         self._track = load_track(track, car.width_m)
         self._line = racing_line(self._track, car)
         self._artefact = build(BuildSettings(car=car))[0]
         self._checks = Checks(GateSettings(), self._artefact, car)
 
-    def drive(
-        self, weights: GpWeights, proven: GpWeights | None, seed: int = 0
-    ) -> tuple[str, float]:
+    def drive(self, weights: Weights, proven: Weights | None, seed: int = 0) -> tuple[str, float]:
         """What became of the weights, and the largest excess over the edge [m]."""
         if not self._checks.judge(encode_weights(weights)).packed:
             return "refused as absurd", -math.inf
@@ -69,5 +65,5 @@ class Course:
         ]
         return "; ".join(found) or "kept", float(run.off_track_m.max())
 
-    def _controller(self, weights: GpWeights) -> PredictiveController:
+    def _controller(self, weights: Weights) -> PredictiveController:
         return compiled_controller(self._artefact, self._car, self._track, self._line, weights)
