@@ -16,8 +16,16 @@ import zenoh
 
 from bayesrace.errors import InputError
 from bayesrace.log import LogWriter
-from bayesrace.messages import EVENT, EVERYTHING, HEARTBEAT, Event, car_key, encode, topic_of
-from bayesrace.transport.publisher import Numbering
+from bayesrace.messages import (
+    EVENT,
+    EVERYTHING,
+    HEARTBEAT,
+    Event,
+    Numbering,
+    car_key,
+    encode,
+    topic_of,
+)
 
 __all__ = ["FLUSH_PERIOD_S", "Recorder", "RecorderCounters"]
 

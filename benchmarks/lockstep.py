@@ -19,7 +19,7 @@ import numpy as np
 from bayesrace.log import LogReader, LogWriter
 from bayesrace.messages import TRUTH
 from bayesrace.operation.closed_loop import ClosedLoop
-from bayesrace.operation.drive import RunPlan
+from bayesrace.operation.run_plan import RunPlan
 from bayesrace.operation.system import started_system
 from bayesrace.recorder import Recorder
 from bayesrace.tracks import DEFAULT_RACE_TRACK

@@ -23,7 +23,7 @@ from bayesrace.arrays import Floats
 from bayesrace.configuration import Configuration
 from bayesrace.log import LogReader
 from bayesrace.messages import STATE
-from bayesrace.operation.drive import RunPlan, run_request
+from bayesrace.operation.run_plan import RunPlan, run_request
 from bayesrace.operation.system import System, started_system
 from bayesrace.recorder import Recorder
 from bayesrace.tracks import DEFAULT_RACE_TRACK

@@ -16,7 +16,7 @@ import numpy as np
 from bayesrace.arrays import Floats
 from bayesrace.controller.driver import Decision, Driver
 from bayesrace.controller.interface import NO_PLAN, Controller, Environment, StepOutput
-from bayesrace.controller.process_settings import ControllerSettings
+from bayesrace.controller.settings import CycleSettings
 from bayesrace.messages import NOT_REPORTED, SENSOR_FAULTS, Actuation, State, Telemetry
 from bayesrace.vehicles.parameters import Car
 
@@ -61,7 +61,7 @@ class Timing:
 class Cycle:
     """Drives one car with one controller; for one thread."""
 
-    def __init__(self, controller: Controller, car: Car, settings: ControllerSettings) -> None:
+    def __init__(self, controller: Controller, car: Car, settings: CycleSettings) -> None:
         """``car``: whose limits hold."""
         self.driver = Driver(controller, car, settings)
         self.timing = Timing()

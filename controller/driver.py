@@ -13,17 +13,16 @@ from typing import Any, Final
 
 from bayesrace.controller.estimator import Belief, Measurement, fill, read
 from bayesrace.controller.interface import Controller, Environment, StepOutput
-from bayesrace.controller.process_settings import ControllerSettings
-from bayesrace.controller.settings import MpcSettings
+from bayesrace.controller.settings import CycleSettings, MpcSettings
 from bayesrace.messages import (
     MOST_INSTRUMENTS,
     QUANTITIES,
     SENSOR_FAULTS,
     BrakingPlan,
+    Numbering,
     Reading,
     State,
 )
-from bayesrace.transport import Numbering
 from bayesrace.vehicles.parameters import Car
 
 __all__ = [
@@ -90,7 +89,7 @@ class Decision:
 class Driver:
     """Drives one car with one controller; for one thread."""
 
-    def __init__(self, controller: Controller, car: Car, settings: ControllerSettings) -> None:
+    def __init__(self, controller: Controller, car: Car, settings: CycleSettings) -> None:
         """``car``: whose limits hold. InputError if the controller's artefact drives no car."""
         self.controller = controller
         artefact = controller.artefact

@@ -2,7 +2,7 @@
 cycle around the step, its fallback and delay compensation; and of the checks of new weights."""
 
 from statistics import NormalDist
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Any, Final, Literal, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
@@ -10,8 +10,8 @@ from bayesrace.defaults import Option
 from bayesrace.vehicles import Car
 
 __all__ = [
-    "SAMPLES", "WATCHED", "CompensationMode", "CompensationSettings", "FallbackSettings",
-    "GateSettings", "MpcSettings",
+    "SAMPLES", "WATCHED", "CompensationMode", "CompensationSettings", "CycleSettings",
+    "FallbackSettings", "GateSettings", "MpcSettings",
 ]  # fmt: skip
 
 SAMPLES: Final = 512
@@ -198,3 +198,44 @@ class GateSettings(BaseModel):
         0.7, gt=0, le=1, description="of the fastest speed that was watched: the limit where going "
         "back would be no better",
     )  # fmt: skip
+
+
+class CycleSettings(BaseModel):
+    """Of the control cycle, whatever hands it the states: see controller/native/br_cycle.c."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    compensation: Annotated[
+        CompensationSettings, Option("--delay", metavar="DELAY", default="measured")
+    ] = Field(
+        CompensationSettings(),
+        description="delay over which the state is predicted: measured, off, or milliseconds",
+    )
+    fallback: FallbackSettings = FallbackSettings()
+    stale_s: float = Field(
+        default=0.06, gt=0, le=60, description="age from which a state is not predicted forward"
+    )
+    sensor_tolerance: float = Field(
+        default=1.0,
+        ge=0,
+        le=1e3,
+        description="contradictions in measured states beyond which they are not believed, as a "
+        "multiple of those by noise of motion capture; 0: every state is",
+    )
+    hold: bool = Field(False, description="do not drive before 'bayesrace go'")
+
+    def cycle_values(self, car: Car) -> dict[str, float]:
+        """The numbers of br_driving (controller/native/bayesrace_cycle.h) by name, but limits."""
+        return {
+            **car.brake_numbers,
+            "standing_mps": car.tuning.driving.standing_mps,
+            "stop_mps2": car.tuning.driving.stop_mps2,
+            "shifted_s": self.fallback.shifted_s,
+            "limit_tolerance": self.fallback.tolerance,
+            "recover_cycles": self.fallback.recover_cycles,
+            "compensation": get_args(CompensationMode).index(self.compensation.mode),
+            "delay_s": self.compensation.delay_s,
+            "longest_s": self.compensation.longest_s,
+            "stale_s": self.stale_s,
+            "sensor_tolerance": self.sensor_tolerance,
+        }

@@ -21,7 +21,7 @@ from bayesrace.columns import Columns, columns_of
 from bayesrace.controller.cycle import Cycle
 from bayesrace.controller.driver import Decision
 from bayesrace.controller.interface import Controller, Environment
-from bayesrace.controller.process_settings import ControllerSettings
+from bayesrace.controller.settings import CycleSettings
 from bayesrace.learning.dataset import Dataset
 from bayesrace.learning.sources import CYCLES, STATES, dataset_from_columns
 from bayesrace.log import LogWriter
@@ -41,7 +41,7 @@ from bayesrace.messages import (
     encode,
 )
 from bayesrace.operation.analysis.laps import LapTimes, Trajectory, time_laps
-from bayesrace.operation.drive import RunPlan, announcement, run_request
+from bayesrace.operation.run_plan import RunPlan, announcement, run_request
 from bayesrace.plant.car import CarRun, End, drive_lockstep, truth_behind
 from bayesrace.plant.simulator import Simulator
 from bayesrace.plant.vehicle import Vehicle
@@ -169,19 +169,19 @@ class ClosedLoop:
         controller: Controller,
         vehicle: Vehicle | None = None,
         log: LogWriter | None = None,
-        settings: ControllerSettings | None = None,
+        settings: CycleSettings | None = None,
         sensors: Sensors = EXACT,
         seed: int = 0,
         delay_s: float = 0.0,
     ) -> None:
         """``vehicle``: what plays the car; the built-in equations without. ``log``: gets the
-        messages that a race records. ``settings``: of the controller process, as far as they
-        concern lockstep. ``sensors`` with the ``seed`` of their errors, and ``delay_s`` of states
-        and of actuations each: those of the plant process.
+        messages that a race records. ``settings``: of the control cycle. ``sensors`` with the
+        ``seed`` of their errors, and ``delay_s`` of states and of actuations each: those of the
+        plant process.
         """
         self._car, self._track, self._line = car, track, line
         self._vehicle = vehicle or built_in_car(car)
-        self._cycle = Cycle(controller, car, settings or ControllerSettings(car=car))
+        self._cycle = Cycle(controller, car, settings or CycleSettings())
         self._controller = controller
         self._log = None if log is None else _Messages(log, car.name)
         self._sensors, self._seed, self._delay_s = sensors, seed, delay_s

@@ -31,7 +31,6 @@ from bayesrace.operation.analysis.recording import (
     read_recording,
     runs_of,
 )
-from bayesrace.operation.drive import RunPlan
 from bayesrace.operation.preparation import (
     PredictionModel,
     Prepared,
@@ -39,6 +38,7 @@ from bayesrace.operation.preparation import (
     progress_artefact,
     updated_weights,
 )
+from bayesrace.operation.run_plan import RunPlan
 from bayesrace.operation.settings import RaceSettings
 from bayesrace.operation.system import Child, System, child, started_system
 from bayesrace.operation.terminal.terminal import Stages

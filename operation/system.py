@@ -21,7 +21,8 @@ from bayesrace.configuration import Configuration, as_toml, configured
 from bayesrace.errors import InputError
 from bayesrace.files import write_whole
 from bayesrace.messages import EVENT, Event
-from bayesrace.operation.drive import RunPlan, announcement, execute
+from bayesrace.operation.drive import execute
+from bayesrace.operation.run_plan import RunPlan, announcement
 from bayesrace.processes import RUN_MODULE
 from bayesrace.recorder import Recorder
 from bayesrace.tracks import Track

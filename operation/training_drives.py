@@ -62,7 +62,7 @@ __all__ = [
 SOURCES: Final = (
     ".", "gp", "messages", "raceline", "tracks",
     "vehicles", "controller", "controller/native", "learning", "plant", "plant/fmu",
-    "operation/closed_loop.py", "operation/collect.py", "operation/drive.py",
+    "operation/closed_loop.py", "operation/collect.py", "operation/run_plan.py",
     "operation/training_drives.py",
 )  # fmt: skip
 """Our code that shapes a training drive and what is learned from it."""

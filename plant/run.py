@@ -8,12 +8,21 @@ from dataclasses import dataclass
 from itertools import chain
 from typing import Final, NamedTuple
 
-from bayesrace.messages import ACTUATION, Actuation, BrakingPlan, Decoder, RunRequest, State, Truth
+from bayesrace.messages import (
+    ACTUATION,
+    Actuation,
+    BrakingPlan,
+    Decoder,
+    Numbering,
+    RunRequest,
+    State,
+    Truth,
+)
 from bayesrace.plant.car import CarRun, End, drive_lockstep, fault_end, truth_behind
 from bayesrace.plant.vehicle import Command, FmuFault, Vehicle, planned_at
 from bayesrace.realtime import SUSPENDED_S, sleep_until_ns
 from bayesrace.sensors import EXACT, Sensors
-from bayesrace.transport import LOCKSTEP_SPIN_S, Inbox, Item, Kind, Numbering, Publisher
+from bayesrace.transport import LOCKSTEP_SPIN_S, Inbox, Item, Kind, Publisher
 from bayesrace.transport.hold import HOLD_MISSING, HoldWatch
 
 __all__ = ["CONTROLLER_LOST", "Run", "RunCounters"]

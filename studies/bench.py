@@ -35,8 +35,8 @@ from bayesrace.gp.weights import Weights, read_weights
 from bayesrace.integrators import PREDICTION, Discretisation
 from bayesrace.messages import State
 from bayesrace.operation.closed_loop import built_in_car
-from bayesrace.operation.drive import RunPlan, run_request
 from bayesrace.operation.preparation import prepare, progress_artefact
+from bayesrace.operation.run_plan import RunPlan, run_request
 from bayesrace.operation.terminal.terminal import Stages, plain_table
 from bayesrace.plant.car import CarRun, drive_lockstep
 from bayesrace.plant.simulator import PLANT

@@ -22,13 +22,13 @@ from bayesrace.log import LogWriter
 from bayesrace.messages import STATE, State, car_key, encode
 from bayesrace.operation.closed_loop import ClosedLoop, Driven, built_in_car
 from bayesrace.operation.collect import collect, room_beside, training_line
-from bayesrace.operation.drive import RunPlan, run_request
 from bayesrace.operation.preparation import (
     Prepared,
     prepare,
     trained_weights,
     training_settings,
 )
+from bayesrace.operation.run_plan import RunPlan, run_request
 from bayesrace.operation.settings import PreparationSettings
 from bayesrace.operation.terminal.terminal import stages_on
 from bayesrace.plant.sensors import SensorPlayer

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from bayesrace.messages import Event, Status
-from bayesrace.operation.drive import RunPlan, run_request
 from bayesrace.operation.learn.records import LapRecord
+from bayesrace.operation.run_plan import RunPlan, run_request
 from bayesrace.transport import Director, Endpoints, free_endpoint, open_session
 from tests.driven import blank
 from tests.network.cars import Course, Program, start_controller, start_plant

@@ -20,7 +20,7 @@ from bayesrace.errors import InputError
 from bayesrace.log import LogReader
 from bayesrace.messages import TRUTH, BrakingPlan, State
 from bayesrace.operation.closed_loop import ClosedLoop
-from bayesrace.operation.drive import RunPlan, run_request
+from bayesrace.operation.run_plan import RunPlan, run_request
 from bayesrace.operation.system import started_system
 from bayesrace.plant.car import End
 from bayesrace.plant.vehicle import planned_at

@@ -16,7 +16,8 @@ from bayesrace.log import LogReader, LogWriter
 from bayesrace.messages import ACTUATION, EVENT, STATE, TELEMETRY, TRUTH, Event, State
 from bayesrace.operation.closed_loop import ClosedLoop
 from bayesrace.operation.collect import collect
-from bayesrace.operation.drive import RunPlan, execute
+from bayesrace.operation.drive import execute
+from bayesrace.operation.run_plan import RunPlan
 from bayesrace.plant.simulator import Simulator
 from bayesrace.plant.vehicle import Command, FmuFault
 from bayesrace.raceline import read_raceline

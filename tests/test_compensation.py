@@ -12,7 +12,7 @@ from bayesrace.arrays import Floats
 from bayesrace.controller.driver import Driver
 from bayesrace.controller.interface import StepOutput
 from bayesrace.controller.settings import CompensationSettings
-from bayesrace.transport import Numbering
+from bayesrace.messages import Numbering
 from tests.cycle_rig import STEP_S, ScriptedLaw, scripted_driver, state
 
 

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from bayesrace.operation.drive import RunPlan
 from bayesrace.operation.preparation import prepare
+from bayesrace.operation.run_plan import RunPlan
 from bayesrace.operation.settings import PreparationSettings
 from bayesrace.operation.system import started_system
 from bayesrace.operation.terminal.terminal import stages_on

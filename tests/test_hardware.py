@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 from bayesrace.errors import InputError
-from bayesrace.messages import Actuation, BrakingPlan, Decoder, RunRequest, State, Truth
+from bayesrace.messages import Actuation, BrakingPlan, Decoder, Numbering, RunRequest, State, Truth
 from bayesrace.plant.car import End
 from bayesrace.plant.hardware import Hardware, Report
 from bayesrace.plant.run import Run, RunCounters
-from bayesrace.transport import Inbox, Item, Kind, Numbering, Publisher
+from bayesrace.transport import Inbox, Item, Kind, Publisher
 from bayesrace.transport.hold import HoldWatch
 from bayesrace.vehicles import get_car
 from tests.driven import blank

@@ -19,8 +19,8 @@ import pytest
 from bayesrace.errors import InputError
 from bayesrace.log import LogReader
 from bayesrace.messages import STATE
-from bayesrace.operation.drive import RunPlan, run_request
 from bayesrace.operation.preparation import Prepared, prepare
+from bayesrace.operation.run_plan import RunPlan, run_request
 from bayesrace.operation.settings import PreparationSettings
 from bayesrace.operation.terminal.terminal import stages_on
 from bayesrace.studies.latency.legs import BESIDE, LEGS

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from bayesrace.errors import InputError
-from bayesrace.operation.drive import RunPlan, run_request
 from bayesrace.operation.lifecycle import find, pick
+from bayesrace.operation.run_plan import RunPlan, run_request
 from bayesrace.operation.terminal.status_table import COUNTERS_SHOWN
 from bayesrace.raceline.line import write_raceline
 from bayesrace.tracks import write_track

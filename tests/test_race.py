@@ -22,8 +22,8 @@ from bayesrace.gp.weights import read_weights, write_weights
 from bayesrace.learning.dataset import Dataset
 from bayesrace.operation import race as driving
 from bayesrace.operation.analysis.results import RaceResult, read_result
-from bayesrace.operation.drive import RunPlan
 from bayesrace.operation.preparation import Prepared, prepare, updated_weights
+from bayesrace.operation.run_plan import RunPlan
 from bayesrace.operation.settings import RaceSettings
 from bayesrace.operation.terminal.terminal import stages_on
 from bayesrace.raceline import read_raceline, write_raceline

@@ -2,7 +2,7 @@
 
 ``endpoints`` says where a process listens and connects, ``credentials`` holds its certificate, and
 ``session`` opens a session with both, and with the access control that follows from the table of
-messages. ``publisher`` sends messages and counts what is lost of them, ``inbox`` is the one
+messages. ``publisher`` sends messages, ``inbox`` is the one
 subscriber, ``requests`` sends requests and serves them; ``director`` starts and follows runs, and
 ``hold`` notices that it is missing.
 """
@@ -20,7 +20,7 @@ from bayesrace.transport.endpoints import (
     private_endpoints,
 )
 from bayesrace.transport.inbox import LOCKSTEP_SPIN_S, NEWEST, POLL_S, Inbox, Item, Kind
-from bayesrace.transport.publisher import HEARTBEAT_S, Heartbeat, Numbering, Publisher
+from bayesrace.transport.publisher import HEARTBEAT_S, Heartbeat, Publisher
 from bayesrace.transport.requests import (
     Answers,
     Request,
@@ -38,7 +38,7 @@ from bayesrace.transport.session import check_session, open_session, open_sessio
 __all__ = [
     "CONTROLLER_ENDPOINT", "HEARTBEAT_S", "LOCKSTEP_SPIN_S", "NEWEST", "PLANT_ENDPOINT", "POLL_S",
     "Answers", "Credentials", "Director", "Endpoint", "Endpoints", "Heartbeat", "Inbox", "Item",
-    "Kind", "LinkLimits", "Member", "Members", "Numbering", "Publisher", "RefusedError", "Request",
+    "Kind", "LinkLimits", "Member", "Members", "Publisher", "RefusedError", "Request",
     "ask", "ask_all", "check_descriptors", "count_processes", "decisive",
     "declare_service", "decode_request", "free_endpoint", "open_session", "open_sessions",
     "private_endpoints",

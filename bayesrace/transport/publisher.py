@@ -1,4 +1,4 @@
-"""Topics with the table's quality of service, a process's heartbeat, and how losses are counted."""
+"""Topics with the table's quality of service, and a process's heartbeat."""
 
 import os
 import time
@@ -13,16 +13,13 @@ from bayesrace.defaults import HEARTBEAT_VARIABLE
 from bayesrace.errors import InputError
 from bayesrace.messages import HEARTBEAT, Message, Status, Topic, car_key, encode
 
-__all__ = ["HEARTBEAT_S", "Heartbeat", "Numbering", "Publisher"]
+__all__ = ["HEARTBEAT_S", "Heartbeat", "Publisher"]
 
 M = TypeVar("M", bound=Message)
 
 HEARTBEAT_S: Final = 0.1
 """Period of heartbeats."""
 _PERIOD_NS: Final = round(HEARTBEAT_S * 1e9)
-_FAR: Final = 1024
-"""Reordering is shorter, and so are most losses: a number farther from the expected one, or 0,
-counts once the next one confirms it."""
 
 
 class Publisher(Generic[M]):
@@ -94,40 +91,3 @@ class Heartbeat:
         if self._file is not None:
             with suppress(OSError):  # a health check may fail, but not the control loop for it
                 os.utime(self._file.fileno())
-
-
-class Numbering:
-    """Received and lost messages of one sender.
-
-    A late message counts as lost until it arrives. A restarted sender begins a new count. A single
-    number far off does not change the losses.
-    """
-
-    def __init__(self) -> None:
-        self.received = 0
-        self.lost = 0
-        self._next: int | None = None
-        self._far: int | None = None
-        """Number of the previous message, if it waits to be confirmed."""
-
-    def restart(self) -> None:
-        """Take the next number, whatever it is, as the first of another sender."""
-        self._next = self._far = None
-
-    def note(self, seq: int) -> None:
-        """Count the next message, in the order of arrival."""
-        self.received += 1
-        far, self._far = self._far, None
-        due = self._next
-        if due is None:
-            self._next = seq + 1
-        elif far is not None and seq == far + 1 != due:
-            self.lost += max(seq - due - 1, 0)
-            self._next = seq + 1
-        elif abs(seq - due) > _FAR or seq == 0:
-            self._far = seq
-        elif seq >= due:
-            self.lost += seq - due
-            self._next = seq + 1
-        elif self.lost > 0:
-            self.lost -= 1

@@ -15,11 +15,10 @@ from bayesrace.errors import InputError, faults_in
 from bayesrace.files import read_text
 from bayesrace.integrators import PREDICTION, Discretisation
 from bayesrace.learning.sources import CYCLES, STATES, TRUE_STATES
-from bayesrace.messages import ACTUATION, EVENT, STATE, TELEMETRY, TRUTH, Topic
+from bayesrace.messages import ACTUATION, EVENT, STATE, TELEMETRY, TRUTH, Numbering, Topic
 from bayesrace.operation.analysis.laps import Trajectory
 from bayesrace.raceline import RaceLine, read_raceline
 from bayesrace.tracks import Track, read_track
-from bayesrace.transport import Numbering
 from bayesrace.vehicles import Car, default_car, described_car
 
 __all__ = [

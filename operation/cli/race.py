@@ -130,7 +130,8 @@ def drive(
     Exit code 0 if all laps were driven on the track, by the controller's solutions; 1 if not; 2 if
     the run could not be driven to its end.
     """
-    from bayesrace.operation.drive import RunPlan, drive_and_judge
+    from bayesrace.operation.drive import drive_and_judge
+    from bayesrace.operation.run_plan import RunPlan
     from bayesrace.tracks import load_track
 
     chosen = settings()

@@ -12,8 +12,8 @@ from typing import Final
 from bayesrace.errors import InputError
 from bayesrace.files import claimed, write_whole
 from bayesrace.messages import Event
-from bayesrace.operation.drive import RunPlan, run_request
 from bayesrace.operation.preparation import prepare
+from bayesrace.operation.run_plan import RunPlan, run_request
 from bayesrace.operation.settings import PreparationSettings
 from bayesrace.operation.system import Child, endings, started_system
 from bayesrace.operation.terminal.terminal import Stages

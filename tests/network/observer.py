@@ -23,7 +23,7 @@ from bayesrace.messages import (
     car_key,
     decode,
 )
-from bayesrace.operation.drive import RunPlan, run_request
+from bayesrace.operation.run_plan import RunPlan, run_request
 from bayesrace.recorder import Recorder
 from bayesrace.tracks import Track
 from bayesrace.transport import Director, Endpoints, open_session

@@ -11,7 +11,7 @@ import pytest
 
 from bayesrace.configuration import read_configuration
 from bayesrace.messages import Event
-from bayesrace.operation.drive import RunPlan, run_request
+from bayesrace.operation.run_plan import RunPlan, run_request
 from bayesrace.recorder import Recorder
 from bayesrace.transport import Director, free_endpoint, open_session
 from tests.network.cars import Course, Program, gentle_course

@@ -17,7 +17,7 @@ from bayesrace.configuration import read_configuration
 from bayesrace.errors import InputError
 from bayesrace.log import LogReader
 from bayesrace.messages import EVENT, State
-from bayesrace.operation.drive import RunPlan, run_request
+from bayesrace.operation.run_plan import RunPlan, run_request
 from bayesrace.recorder import Recorder
 from bayesrace.transport import Director, free_endpoint, open_session
 from tests.network.cars import Course, Program

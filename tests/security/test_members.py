@@ -10,7 +10,7 @@ from bayesrace.configuration import read_configuration
 from bayesrace.errors import InputError
 from bayesrace.messages import COMMAND, STOP, Command, StopRequest, car_key, encode
 from bayesrace.operation.certificates import add, init, revoke
-from bayesrace.operation.drive import RunPlan, run_request
+from bayesrace.operation.run_plan import RunPlan, run_request
 from bayesrace.transport import free_endpoint
 from tests.driven import blank
 from tests.network.cars import Course, Program

@@ -18,7 +18,7 @@ from bayesrace.codegen.settings import BuildSettings
 from bayesrace.gp.weights import Weights, encode_weights, write_weights
 from bayesrace.log import LogReader
 from bayesrace.messages import EVENT, STATE, TELEMETRY, Event, State, car_key, decode
-from bayesrace.operation.drive import RunPlan, run_request
+from bayesrace.operation.run_plan import RunPlan, run_request
 from bayesrace.raceline.line import write_raceline
 from bayesrace.recorder import Recorder
 from bayesrace.tracks import Track, write_track
