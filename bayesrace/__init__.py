@@ -1,14 +1,88 @@
-"""What all parts of BayesRace share: cars, integrators, tracks, racing line, residual, messages."""
+"""BayesRace: a race car driven at its limit by GP-MPC that learns from its own laps.
 
-__all__ = ["__version__"]
+    import bayesrace as br
+
+    car = br.Car.load("orca")
+    track = br.Track.load("harbour")
+    line = br.racing_line(track, car)
+    controller = br.Controller(car, track, line)
+    run = br.drive(controller, br.Simulator(car, track), laps=2)
+    controller.weights = br.train(run)
+    print(br.drive(controller, br.Simulator(car, track), laps=2).laps)
+
+What ``__all__`` names is public, and nothing else; it is imported when it is first used.
+docs/python.md begins with it.
+"""
+
+from typing import TYPE_CHECKING, Any, Final
+
+if TYPE_CHECKING:
+    from bayesrace.api import gym as gym
+    from bayesrace.api import ocp as ocp
+    from bayesrace.api.controller import Controller as Controller
+    from bayesrace.api.controller import Status as Status
+    from bayesrace.api.controller import Step as Step
+    from bayesrace.api.controller import Times as Times
+    from bayesrace.api.logs import Log as Log
+    from bayesrace.api.mpc import Mpc as Mpc
+    from bayesrace.api.mpc import Solution as Solution
+    from bayesrace.api.runs import Run as Run
+    from bayesrace.api.runs import drive as drive
+    from bayesrace.api.simulator import OwnSimulator as OwnSimulator
+    from bayesrace.api.simulator import Simulator as Simulator
+    from bayesrace.api.training import Drive as Drive
+    from bayesrace.api.training import residuals as residuals
+    from bayesrace.api.training import train as train
+    from bayesrace.api.values import Input as Input
+    from bayesrace.api.values import State as State
+    from bayesrace.codegen.problems.problem import Problem as Problem
+    from bayesrace.controller.driver import Level as Level
+    from bayesrace.errors import InputError as InputError
+    from bayesrace.gp.weights import Weights as Weights
+    from bayesrace.raceline import RaceLine as RaceLine
+    from bayesrace.raceline import racing_line as racing_line
+    from bayesrace.tracks import Track as Track
+    from bayesrace.vehicles import Car as Car
 
 __version__: str
 
+_PLACES: Final = {
+    "Car": "vehicles", "Controller": "api.controller", "Drive": "api.training",
+    "Input": "api.values", "InputError": "errors", "Level": "controller.driver", "Log": "api.logs",
+    "Mpc": "api.mpc", "OwnSimulator": "api.simulator", "Problem": "codegen.problems.problem",
+    "RaceLine": "raceline", "Run": "api.runs", "Simulator": "api.simulator",
+    "Solution": "api.mpc", "State": "api.values", "Status": "api.controller",
+    "Step": "api.controller", "Times": "api.controller", "Track": "tracks",
+    "Weights": "gp.weights", "drive": "api.runs", "gym": "api", "ocp": "api",
+    "racing_line": "raceline", "residuals": "api.training", "train": "api.training",
+}  # fmt: skip
+"""The module of each public name."""
 
-def __getattr__(name: str) -> str:
-    """The version, looked up when it is asked for: that takes longer than to print the help."""
-    if name != "__version__":
+__all__ = ["__version__", *_PLACES]
+
+
+def __getattr__(name: str) -> Any:
+    """A public name, imported when it is first used: that takes longer than to print a help."""
+    from importlib import import_module
+
+    if name == "__version__":
+        return _version()
+    if name not in _PLACES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    found = import_module(f"{__name__}.{_PLACES[name]}")
+    if _PLACES[name] == "api":
+        found = import_module(f"{__name__}.api.{name}")
+    else:
+        found = getattr(found, name)
+    globals()[name] = found
+    return found
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)
+
+
+def _version() -> str:
     from importlib.metadata import PackageNotFoundError, version
 
     try:

@@ -2,6 +2,7 @@
 drives it."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, TypeVar
@@ -177,15 +178,17 @@ def compiled_controller(
     settings: MpcSettings | None = None,
     *,
     table: PathTable | None = None,
+    parameters: Mapping[str, float] | None = None,
 ) -> PredictiveController:
     """The compiled controller of ``artefact`` on a track, ready to drive.
 
     ``weights``, or their file: without, it predicts by the uncorrected model. ``table``: of track
-    and line, where it is known already.
+    and line, where it is known already. ``parameters``: what the problem has beyond those of
+    ``settings``.
 
     Raises InputError if artefact, car, line or weights do not fit together.
     """
-    step = NativeStep(artefact, car, settings or MpcSettings())
+    step = NativeStep(artefact, car, settings or MpcSettings(), parameters)
     step.set_path(table or make_path_table(track, line, car.tuning.path.spacing_m))
     if weights is not None:
         step.set_weights(read_weights(weights) if isinstance(weights, Path) else weights)

@@ -282,7 +282,8 @@ class Driver:
         measured.time_s, measured.lockstep = state.time_s, state.lockstep
         measured.x, measured.u_applied = state.x, state.u_applied
         measured.delays = len(delays_s)
-        measured.delays_s[0 : len(delays_s)] = delays_s
+        if delays_s:
+            measured.delays_s[0 : len(delays_s)] = delays_s
         measured.estimated, measured.measurements = state.estimated, 0
         if state.estimated:
             found = (self._measurement(one, instruments) for one in state.readings)

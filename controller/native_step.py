@@ -435,12 +435,20 @@ class NativeProblem:
 class NativeStep(NativeProblem):
     """The control step of a car that follows a racing line."""
 
-    def __init__(self, artefact: Path, car: Car, settings: MpcSettings) -> None:
-        """InputError if it was built for another car."""
+    def __init__(
+        self,
+        artefact: Path,
+        car: Car,
+        settings: MpcSettings,
+        parameters: Mapping[str, float] | None = None,
+    ) -> None:
+        """``parameters``: what the problem has beyond those of ``settings``. InputError if it was
+        built for another car."""
         super().__init__(artefact)
         self.manifest.check_car(car, artefact)
         self._line_mps, self._spacing_m = np.zeros(0), 0.0
-        self.set_parameters(car, settings)
+        values = settings.parameters(car, self.manifest.problem.name)
+        self.set_values(values | dict(parameters or {}))
 
     def set_parameters(self, car: Car, settings: MpcSettings) -> None:
         """Weights, limits and tolerances of the OCP; effective from the next step."""

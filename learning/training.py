@@ -69,7 +69,10 @@ from bayesrace.learning.target import KernelScore, Target
 from bayesrace.learning.validation import identity, residual
 from bayesrace.processes import die_with_parent
 
-__all__ = ["MAX_SAMPLES", "NICE", "Outcome", "Trainer", "Training", "fit", "perform", "train"]
+__all__ = [
+    "MAX_SAMPLES", "NICE", "Outcome", "Trainer", "Training", "check_samples", "fit", "perform",
+    "train",
+]  # fmt: skip
 
 _log = logging.getLogger(__name__)
 
@@ -167,7 +170,7 @@ def _fit(
 ) -> Training:
     """One training on these samples; ``widen`` as in the settings."""
     model, errors = identity(dataset, discretisation), residual(dataset, discretisation)
-    _check(dataset, errors)
+    check_samples(dataset, errors)
     samples = dataset
     if symmetric(dataset, discretisation):
         samples = dataset.with_mirror_images()
@@ -218,7 +221,7 @@ def _fit(
     return Training(_named(weights), tuple(kernels), dataset)
 
 
-def _check(dataset: Dataset, errors: Floats) -> None:
+def check_samples(dataset: Dataset, errors: Floats) -> None:
     """InputError for samples that nothing can be learned from; ``errors``: their residuals."""
     count = len(dataset)
     if not MIN_SAMPLES <= count <= MAX_SAMPLES:

@@ -145,9 +145,9 @@ class Driven(Trajectory):
         return dataset_from_columns(self.moments, cycles, self.car, self.step_s)
 
     def __str__(self) -> str:
-        laps = " ".join(f"{t:.3f}" for t in self.laps_s) or "did not finish"
+        laps = " ".join(f"{t:.3f}" for t in self.laps_s)
         off = int((self.off_track_m > 0).sum())
-        text = f"{laps} s, {off} off track"
+        text = f"{laps} s, {off} off track" if laps else f"no lap finished, {off} off track"
         if off:
             text += f" (deepest {1e3 * float(self.off_track_m.max()):.0f} mm)"
         return text + (f", {self.fallbacks} fallbacks" if self.fallbacks else "")

@@ -15,20 +15,26 @@ executes anything.
 import hashlib
 import os
 import struct
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, Final, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, Final, get_type_hints
 
 import msgpack
 import numpy as np
+from numpy.typing import ArrayLike
 from pydantic import AfterValidator, Field, InstanceOf, PlainValidator, TypeAdapter, ValidationError
 
 from bayesrace.arrays import Floats
 from bayesrace.defaults import MAX_POINTS, MAX_WEIGHTS_BYTES
 from bayesrace.errors import InputError, faults_in
 from bayesrace.files import read_whole, write_whole
+
+if TYPE_CHECKING:
+    from sklearn.gaussian_process import GaussianProcessRegressor
+
+    from bayesrace.vehicles.parameters import Car
 
 __all__ = [
     "FEATURES",
@@ -41,6 +47,7 @@ __all__ = [
     "decode_weights",
     "encode_weights",
     "OUTPUT_HEAD",
+    "pack_outputs",
     "pack_weights",
     "read_weights",
     "write_weights",
@@ -121,11 +128,12 @@ def _validate(item: "GpOutput | Weights") -> None:
 class GpOutput:
     """One output of the residual GP; see the module text for the formula.
 
-    ``inputs`` (n, 6) are training inputs in the features' own units, ``alpha`` (n,) is
-    (K + noise)^-1 y of the scaled targets y = (residual - y_mean) / y_scale, ``length_scales`` (6,)
-    have the features' units. ``signal_variance`` and ``noise_variance`` are in units of scaled y.
-    Where states were estimated, ``alpha`` is that of the mean that the readings leave, and
-    ``noise_variance`` what leaves their variance (:mod:`bayesrace.learning.conditioning`).
+    ``inputs`` (n, m) are training inputs in the features' own units (m is 6 for a car), ``alpha``
+    (n,) is (K + noise)^-1 y of the scaled targets y = (residual - y_mean) / y_scale,
+    ``length_scales`` (m,) have the features' units. ``signal_variance`` and ``noise_variance`` are
+    in units of scaled y. Where states were estimated, ``alpha`` is that of the mean that the
+    readings leave, and ``noise_variance`` what leaves their variance
+    (:mod:`bayesrace.learning.conditioning`).
     n = 0 means no correction beyond ``y_mean``. Raises InputError for anything inconsistent.
     """
 
@@ -143,7 +151,7 @@ class GpOutput:
             known = ", ".join(KERNELS)
             raise InputError(f"GP weights: unknown kernel {self.kernel!r:.40}; known: {known}")
         _validate(self)
-        width, shapes = len(FEATURES), [self.length_scales.shape, self.inputs.shape]
+        width, shapes = self.length_scales.size, [self.length_scales.shape, self.inputs.shape]
         if self.alpha.ndim != 1 or shapes != [(width,), (self.count, width)]:
             raise InputError(
                 f"GP weights: length_scales, inputs and alpha have the shapes {shapes[0]}, "
@@ -199,6 +207,11 @@ class Weights:
 
     def __post_init__(self) -> None:
         _validate(self)
+        widths = {output.inputs.shape[1] for output in self.outputs}
+        if widths != {len(FEATURES)}:
+            raise InputError(
+                f"GP weights: inputs of {sorted(widths)} features, expected {', '.join(FEATURES)}"
+            )
         features, residuals = self.sample_features, self.sample_residuals
         shapes = (len(features), len(FEATURES)), (len(features), len(OUTPUTS))
         if (features.shape, residuals.shape) != shapes:
@@ -206,6 +219,47 @@ class Weights:
                 f"GP weights: sample_features and sample_residuals have the shapes "
                 f"{features.shape} and {residuals.shape}, expected {shapes[0]} and {shapes[1]}"
             )
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> "Weights":
+        """From a file; InputError names the file and what is wrong with it."""
+        return read_weights(path)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Writes the file that ``--weights`` and ``bayesrace publish`` take, or nothing."""
+        write_weights(path, self)
+
+    def predict(self, z: ArrayLike) -> Floats:
+        """Correction (m, 3) of vx, vy [m/s] and omega [rad/s] per step, at features ``z`` (m, 6) in
+        the order of :data:`FEATURES`, SI units. InputError for another shape."""
+        from bayesrace.gp.expression import evaluate_mean
+
+        return evaluate_mean(self, z)
+
+    @classmethod
+    def from_sklearn(
+        cls,
+        regressors: "Sequence[GaussianProcessRegressor]",
+        car: "Car",
+        version: str = "scikit-learn",
+    ) -> "Weights":
+        """Of fitted regressors for vx, vy and omega, with the same predictions.
+
+        Each is fitted to features (n, 6) in the order of :data:`FEATURES` and to what the
+        e-kinematic model of ``car`` errs by in a step (n,), as :func:`bayesrace.residuals` gives
+        them. Their kernel is ConstantKernel * (RBF or Matern) + WhiteKernel, with or without any of
+        these but the middle; InputError names what else there is.
+        """
+        from bayesrace.gp.scikit import weights_of
+
+        return weights_of(regressors, car, version=version)
+
+    def to_sklearn(self) -> "tuple[GaussianProcessRegressor, ...]":
+        """A fitted regressor each for vx, vy and omega, with the same predictions; InputError for
+        an output without training points."""
+        from bayesrace.gp.scikit import regressors_of
+
+        return regressors_of(self)
 
     def check_fit(self, discretisation: str, capacity: int) -> None:
         """InputError unless a controller can use them that predicts by ``discretisation`` and has
@@ -346,13 +400,18 @@ def decode_weights(data: bytes) -> Weights:
 
 
 def pack_weights(weights: Weights) -> bytes:
-    """What the compiled step needs of them, as in the weights file of hosts in C.
+    """What the compiled step needs of them, as in the weights file of hosts in C."""
+    return pack_outputs(weights.outputs)
+
+
+def pack_outputs(outputs: Iterable[GpOutput]) -> bytes:
+    """The same of the outputs of any problem's residual.
 
     For each output the members of br_mpc_gp: kernel and points as u32, offset, scale, signal, noise
     and the arrays as f64, little-endian.
     """
     parts = []
-    for output in weights.outputs:
+    for output in outputs:
         kernel = KERNELS.index(output.kernel)
         parts.append(OUTPUT_HEAD.pack(kernel, output.count, *output.amplitudes))
         numbers = (output.length_scales, output.inputs, output.alpha)

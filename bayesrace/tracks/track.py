@@ -9,7 +9,8 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Final, NamedTuple
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -19,6 +20,9 @@ from bayesrace.cache import digest
 from bayesrace.errors import InputError
 from bayesrace.tracks.checks import find_fault
 from bayesrace.tracks.spline import CentrelineSearch, PlaneSpline, fit_arc_length
+
+if TYPE_CHECKING:
+    from bayesrace.vehicles.parameters import Car
 
 __all__ = ["Crossing", "CrossingLine", "PathProjection", "StartLine", "Track", "drop_repeated"]
 
@@ -55,6 +59,30 @@ class Track:
     width_right_m: Floats
     width_left_m: Floats
     length_m: float
+
+    @classmethod
+    def load(
+        cls, source: "str | Path | npt.ArrayLike", car: "Car | None" = None, name: str = "track"
+    ) -> "Track":
+        """A built-in track, ``random:SEED`` or ``random10:SEED``, that in a CSV file or a ROS map
+        (``.yaml``), or points.
+
+        Points are rows x, y, width to the right, width to the left, shape (n, 4), in metres and in
+        driving order; ``name`` is theirs. ``car``: which must fit on it, by width and scale.
+        InputError names the place and the remedy.
+        """
+        from bayesrace.tracks.library import load_any
+
+        width_m = None if car is None else car.width_m
+        if isinstance(source, str | Path):
+            return load_any(str(source), width_m)[0]
+        points = np.asarray(source, dtype=float)
+        if points.ndim != 2 or points.shape[1:] != (4,):
+            raise InputError(
+                f"track '{name}': an array of shape {points.shape}, expected (n, 4): x, y, width "
+                "to the right, width to the left [m]"
+            )
+        return cls.from_points(name, points[:, :2], points[:, 2], points[:, 3], width_m or 0.0)
 
     @classmethod
     def from_points(

@@ -147,6 +147,14 @@ class Car(Part):
     def _complete(cls, value: Any, info: ValidationInfo) -> Any:
         return Tuning.completed(value, _scales(info.data)) if isinstance(value, dict) else value
 
+    @classmethod
+    def load(cls, source: "str | Path | Car") -> "Car":
+        """The built-in car of that name, or the car in that TOML file (docs/extending.md).
+
+        InputError names the built-in cars, or field, value, unit and remedy of each fault.
+        """
+        return get_car(source)
+
     @property
     def wheelbase_m(self) -> float:
         """Distance between the axles, lf + lr."""

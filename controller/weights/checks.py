@@ -121,17 +121,19 @@ class Checks:
             return Verdict(str(error), facts)
         return Verdict(text, facts, pack_weights(new))
 
-    def check_start(self, data: bytes) -> None:
-        """InputError unless a weights file may drive from the start, before the car has moved."""
+    def check_start(self, data: bytes, recent: Samples = NO_SAMPLES) -> bytes:
+        """Arrays of weights that may drive from the start, as ``packed`` of a verdict; InputError
+        for others. ``recent``: what the car did last, if it has moved."""
         weights = decode_weights(data)
         if any(weights.counts) and not len(weights.sample_features):
             raise InputError(
                 f"weights '{weights.version}' hold no samples that they can be checked by; train "
                 "again, or start without them and use 'bayesrace publish'"
             )
-        verdict = self.judge(data)
+        verdict = self.judge(data, recent)
         if not verdict.packed:
             raise InputError(verdict.text)
+        return verdict.packed
 
     def _after(self, weights: Weights | None, features: Floats) -> Floats:
         """vx, vy, omega (n, 3) a step later, by the model that these weights correct; NaN where it

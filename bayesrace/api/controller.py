@@ -1,0 +1,287 @@
+"""The controller as an object with ``step``, for control loops of one's own."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import IntEnum
+from pathlib import Path
+from time import perf_counter_ns
+from typing import TYPE_CHECKING, Any, Final, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+from pydantic import ValidationError
+
+from bayesrace.api.values import Input, Range, State
+from bayesrace.arrays import Floats
+from bayesrace.controller.assembly import PredictiveController, compiled_controller
+from bayesrace.controller.driver import Driver, Level
+from bayesrace.controller.native_step import NativeStep
+from bayesrace.controller.settings import CycleSettings, GateSettings, MpcSettings
+from bayesrace.controller.weights.checks import Checks, Samples
+from bayesrace.errors import InputError, faults_in
+from bayesrace.gp.weights import Weights, encode_weights, read_weights
+from bayesrace.messages import SENSOR_FAULTS
+from bayesrace.messages import State as Measured
+from bayesrace.raceline import RaceLine, check_line, racing_line
+from bayesrace.tracks import Track
+from bayesrace.vehicles import Car
+
+if TYPE_CHECKING:
+    from bayesrace.codegen.problems.problem import Problem
+
+__all__ = ["Controller", "Status", "Step", "Times", "validated"]
+
+
+class Status(IntEnum):
+    """What became of a step's optimisation problem, or why there was none."""
+
+    CONVERGED = 0
+    """Solved to the tolerance, or acceptable: driven."""
+    ACCEPTABLE = 1
+    DEFECT = 2
+    """The plan does not follow the model."""
+    INFEASIBLE = 3
+    QP_LIMIT = 4
+    NOT_FINITE = 5
+    BAD_STATE = 6
+    TIME_LIMIT = 7
+    DOUBTED = 251
+    """The state contradicts those before it."""
+    UNPREDICTABLE = 252
+    """The state is too old to be predicted to the moment of acting."""
+    HALTED = 253
+    NO_STATE = 254
+    STEP_FAILED = 255
+
+
+@dataclass(slots=True)
+class Times:
+    """Where the time of a step went [us]."""
+
+    solve: float
+    """Execution time of the compiled step, from state to input."""
+    prepare: float
+    """Preparation of the next step, after the input was known; 0 if it is yet to be made."""
+
+
+@dataclass(slots=True)
+class Step:
+    """Result of one control step; its arrays are copies."""
+
+    u: Input
+    """To apply until the next step."""
+    plan: Floats
+    """Predicted states, shape (N + 1, 7), from the moment at which the input acts; empty, (0, 7),
+    where no plan was made."""
+    plan_u: Floats
+    """Planned inputs, shape (N, 2) or (0, 2)."""
+    tube: Floats
+    """Standard deviation of the car's place across the plan at stages 1 to N [m], shape (N,)."""
+    status: Status
+    level: Level
+    """Who gave the input: the solution, the plan before, the fallback's braking, or stop."""
+    fault: str
+    """What speaks against the state that was given; empty: nothing."""
+    times: Times
+
+
+_NO_PLAN: Final = np.zeros((0, 7)), np.zeros((0, 2)), np.zeros(0)
+_STATUS: Final = {int(one): one for one in Status}
+
+
+class Controller:
+    """The predictive controller of one car on one track, as a controller process has it: planner,
+    delay compensation, monitor of the states, step, and fallback. For one thread.
+
+    Each step costs some 10 us beyond the compiled code. States count from the first step, or the
+    last :meth:`reset`, which a run begins with.
+    """
+
+    def __init__(
+        self,
+        car: Car,
+        track: Track,
+        line: RaceLine | None = None,
+        *,
+        problem: "str | Problem" = "tracking",
+        model: Literal["e_kinematic", "dynamic"] = "e_kinematic",
+        weights: Weights | Path | str | None = None,
+        horizon: int | None = None,
+        settings: Mapping[str, Any] | None = None,
+        parameters: Mapping[str, float] | None = None,
+        delay_s: float | None = None,
+    ) -> None:
+        """Generates and compiles C the first time (some seconds), and takes it from the cache then.
+
+        ``line``: that of :func:`bayesrace.racing_line` without. ``problem``: ``"tracking"`` (the
+        paper's: follow the line at its speed), ``"progress"`` (as fast as possible), or one of your
+        own, made of :mod:`bayesrace.codegen.problems.driving`; ``parameters`` gives numbers to what
+        it has beyond that. ``model``: what it predicts by, e_kinematic with a learned correction,
+        or the simulator's own, ``"dynamic"``: BestCase. ``horizon``: stages; the car's without.
+        ``settings``: of the optimisation by name (:class:`.MpcSettings`), such as
+        ``{"caution": 0}``. ``delay_s``: from a state to the moment at which its input acts, where
+        it is known and constant; without, what :meth:`step` is told counts.
+
+        InputError names what does not fit together.
+        """
+        from bayesrace.codegen.build import build
+        from bayesrace.codegen.settings import BuildSettings
+
+        self.car, self.track = car, track
+        self.line = line if line is not None else racing_line(track, car)
+        _check_direction(self.line, track)
+        check_line(self.line, track, car, "the racing line")
+        named = {"problem": problem} if isinstance(problem, str) else {}
+        own = None if isinstance(problem, str) else problem
+        if model == "dynamic":
+            wanted = BuildSettings.best_case(car, horizon)
+            wanted = validated(BuildSettings, wanted.model_dump() | named)
+        else:
+            wanted = validated(
+                BuildSettings, {"car": car, "model": model, "horizon": horizon} | named
+            )
+        tuned = validated(MpcSettings, dict(settings or {}))
+        self._folder, _ = build(wanted, problem=own)
+        self.predictive: PredictiveController = compiled_controller(
+            self._folder, car, track, self.line, None, tuned, parameters=parameters
+        )
+        """What a process and :func:`bayesrace.drive` drive by."""
+        compensation = {} if delay_s is None else {"mode": "fixed", "delay_s": delay_s}
+        self.cycle_settings = validated(CycleSettings, {"compensation": compensation})
+        self._driver = Driver(self.predictive, car, self.cycle_settings)
+        self._range = Range(car, track)
+        self._run = self._seq = 0
+        self._weights: Weights | None = None
+        self.reset()
+        if weights is not None:
+            self.weights = read_weights(weights) if isinstance(weights, Path | str) else weights
+
+    @property
+    def native(self) -> NativeStep:
+        """The compiled step, for measurements: its info, reference, evaluation."""
+        return self.predictive.native
+
+    @property
+    def step_s(self) -> float:
+        """Length of a stage, and the usual time between two steps [s]."""
+        return self.native.manifest.step_s
+
+    @property
+    def weights(self) -> Weights | None:
+        """The correction of the model that drives from the next step on; None: none.
+
+        Weights are checked when they are set, as published ones are: InputError for those of
+        another car or model, with absurd corrections, or that predict worse than no correction, on
+        their own samples or on what the car has done last.
+        """
+        return self._weights
+
+    @weights.setter
+    def weights(self, weights: Weights | None) -> None:
+        if weights is None:
+            self.native.load_weights(b"")
+        elif not isinstance(weights, Weights):
+            raise InputError(
+                f"weights = {type(weights).__name__}: give what bayesrace.train or "
+                "Weights.from_sklearn returns"
+            )
+        else:
+            checks = Checks(GateSettings(), self._folder, self.car)
+            recent = Samples(*self.native.samples())
+            packed = checks.check_start(encode_weights(weights), recent)
+            self.native.load_weights(packed, weights.version)
+        self._weights = weights
+
+    def reset(self) -> None:
+        """The next state is the first of a run: nothing is known of the car's past."""
+        self._driver.lost(silent=False)
+        self._run += 1
+        self._steps, self._dt, self._begin_s = 0, 0.0, 0.0
+        self._u = (0.0, 0.0)
+        self._first = True
+
+    def step(
+        self,
+        state: State | ArrayLike | None,
+        dt: float | None = None,
+        *,
+        u_applied: Input | ArrayLike | None = None,
+        delay_s: float | None = None,
+        prepare: bool = True,
+    ) -> Step:
+        """One control step from a measured state.
+
+        ``state``: (x, y, psi, vx, vy, omega, delta) in SI units; None if nothing was measured: the
+        last one is predicted forward for a while, then the fallback brakes. ``dt``: time since the
+        state before [s], :attr:`step_s` without; of no meaning for the first. ``u_applied``: input
+        that acted meanwhile, on average; what the step before returned, without. ``delay_s``: how
+        long after its state the newest input began to act: later states are predicted by as much.
+        ``prepare`` False: call :meth:`prepare` yourself once the input is on its way.
+
+        InputError for a state or time that cannot be; nothing has happened then.
+        """
+        x = None if state is None else self._range.checked(state)
+        applied = self._u if u_applied is None else tuple(Input.of(u_applied))
+        time_s = self._clock(self.step_s if dt is None else dt)
+        driver = self._driver
+        if x is not None:
+            delays = () if delay_s is None else (float(max(self._seq - 1, 0)), delay_s, delay_s)
+            driver.observe(
+                Measured(
+                    seq=self._seq, source_time_ns=0, epoch=1, run=self._run, time_s=time_s, x=x,
+                    u_applied=applied, lap=0, lockstep=True, actuation_delays=delays, final=False,
+                    estimated=False, readings=(),
+                )
+            )  # fmt: skip
+            self._seq += 1
+        elif self._first:
+            raise InputError("state = None: the first step of a run needs a state")
+        self._first = False
+        decision = driver.decide(time_s)
+        self._u = decision.d, decision.delta_rate
+        plan, plan_u, tube = _NO_PLAN
+        if decision.stepped:
+            native = self.native
+            plan, plan_u = native.read_plan()
+            plan, plan_u, tube = plan.copy(), plan_u.copy(), native.read_tube().copy()
+        return Step(
+            Input(*self._u), plan, plan_u, tube, _STATUS[decision.status], decision.level,
+            SENSOR_FAULTS[decision.fault],
+            Times(decision.step_us, self.prepare() if prepare else 0.0),
+        )  # fmt: skip
+
+    def prepare(self) -> float:
+        """Prepares the next step, for a state that comes an interval after the last; how long it
+        took [us]."""
+        begin_ns = perf_counter_ns()
+        self._driver.prepare(self._driver.interval_s, 0.0)
+        return (perf_counter_ns() - begin_ns) * 1e-3
+
+    def _clock(self, dt: float) -> float:
+        """Plant time of the state, without the rounding of a sum; InputError for no time."""
+        if self._first:
+            return 0.0
+        if not 0.0 < dt <= 10.0:
+            raise InputError(f"dt = {dt!r}: give seconds since the state before, above 0")
+        if dt != self._dt:
+            self._begin_s, self._steps, self._dt = self._begin_s + self._steps * self._dt, 0, dt
+        self._steps += 1
+        return self._begin_s + self._steps * dt
+
+
+def validated(form: Any, values: dict[str, Any]) -> Any:
+    """Settings of this form; InputError names what is wrong with the values."""
+    try:
+        return form.model_validate({k: v for k, v in values.items() if v is not None and v != {}})
+    except ValidationError as error:
+        raise InputError(faults_in(error, "the settings", form)) from None
+
+
+def _check_direction(line: RaceLine, track: Track) -> None:
+    """InputError for a line that is driven the other way round."""
+    heading = track.heading(track.project_path(line.xy_m).s_m)
+    if float(np.mean(np.cos(line.psi_rad - heading))) < 0:
+        raise InputError(
+            f"the racing line '{line.track_name}' runs against the track '{track.name}': turn one "
+            "of them round, the track by track.driven_from(reverse=True)"
+        )

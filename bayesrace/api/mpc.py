@@ -1,0 +1,165 @@
+"""A control problem of one's own: generated, compiled, and stepped."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from bayesrace.api.controller import Status, validated
+from bayesrace.arrays import Floats
+from bayesrace.codegen.problems.problem import Problem
+from bayesrace.controller.native_step import NativeProblem
+from bayesrace.errors import InputError
+from bayesrace.gp.weights import pack_outputs
+from bayesrace.integrators import Discretisation
+
+if TYPE_CHECKING:
+    from sklearn.gaussian_process import GaussianProcessRegressor
+
+__all__ = ["Mpc", "Solution"]
+
+_SOLVER: Final = {
+    "tolerance": 1e-6, "defect_max": 0.03, "early_stop_tol": 0.0, "iterations": 10,
+    "iterations_cold": 50,
+}  # fmt: skip
+
+
+@dataclass(slots=True)
+class Solution:
+    """Result of one step; its arrays are copies."""
+
+    u: Floats
+    """First input, shape (nu,)."""
+    plan: Floats
+    """Predicted states, shape (N + 1, nx)."""
+    plan_u: Floats
+    """Planned inputs, shape (N, nu)."""
+    status: Status
+    cost: float
+    iterations: int
+    solve_us: float
+    """Execution time of the compiled step [us]."""
+
+    @property
+    def usable(self) -> bool:
+        """Whether the input may be applied: solved to the tolerance, or acceptable."""
+        return self.status <= Status.ACCEPTABLE
+
+
+class Mpc:
+    """Model predictive control of any system that a :class:`bayesrace.Problem` describes, with
+    Gaussian processes that correct its model if it has a residual. For one thread.
+
+    It solves; there is no fallback, and no planner: the parameters of each stage are the caller's.
+    A problem that follows a path is for :class:`bayesrace.Controller`, which has both.
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        horizon: int,
+        step_s: float,
+        parameters: Mapping[str, float],
+        *,
+        solver: Mapping[str, float] | None = None,
+        points: int = 1024,
+    ) -> None:
+        """Generates and compiles C the first time, and takes it from the cache then.
+
+        ``horizon``: stages, 2 to 100. ``step_s``: length of a stage, that of ``problem.f``.
+        ``parameters``: run-time parameters by name; those left out are 0. ``solver``: tolerance,
+        defect_max, early_stop_tol, iterations, iterations_cold (:class:`.MpcSettings`).
+        ``points``: of the correction, at most. InputError names what cannot be used.
+        """
+        from bayesrace.codegen.build import build
+        from bayesrace.codegen.settings import BuildSettings
+
+        settings = validated(
+            BuildSettings,
+            {"discretisation": Discretisation(step_s=step_s), "horizon": horizon,
+             "gp_capacity": points},
+        )  # fmt: skip
+        self.problem, self.step_s = problem, step_s
+        folder, _ = build(settings, problem=problem)
+        self.native = NativeProblem(folder)
+        """The compiled problem, for measurements."""
+        self.native.set_values(_SOLVER | dict(parameters) | dict(solver or {}))
+        self._shape = horizon, len(problem.stage_parameters)
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Names of the run-time parameters."""
+        return tuple(one.name for one in self.problem.parameters)
+
+    def set_parameters(self, **values: float) -> None:
+        """Changes run-time parameters from the next step on; InputError for an unknown name, or a
+        value that the problem does not allow."""
+        self.native.set_values(values)
+
+    def correct(self, regressors: "Sequence[GaussianProcessRegressor]") -> None:
+        """Corrects the model by fitted regressors, one for each output of its residual, from the
+        next step on; an empty sequence: no correction.
+
+        Each predicts, from the problem's ``features`` (n, nz), what ``problem.f`` errs by in a
+        step. InputError for kernels other than ConstantKernel * (RBF or Matern) + WhiteKernel.
+        """
+        from bayesrace.gp.scikit import output_of
+
+        count, width = self.problem.outputs, len(self.problem.features)
+        if len(regressors) not in (0, count):
+            raise InputError(
+                f"{len(regressors)} regressors: the residual of '{self.problem.name}' has {count} "
+                "outputs; give one for each, or none"
+            )
+        named = [output_of(one, f"regressor {i}", width) for i, one in enumerate(regressors)]
+        self.native.load_weights(pack_outputs(named), "scikit-learn" if named else "")
+
+    def reset(self) -> None:
+        """Forgets the last plan: the next step starts cold."""
+        self.native.reset()
+
+    def step(
+        self,
+        x: ArrayLike,
+        stages: ArrayLike,
+        u_before: ArrayLike | None = None,
+        *,
+        dt: float | None = None,
+        budget_s: float = 0.0,
+    ) -> Solution:
+        """One step from the measured state ``x`` (nx,).
+
+        ``stages``: parameters of stages 1 to N, shape (N, np), or (np,) for the same at each.
+        ``u_before``: input (nu,) that acts now; zeros without. ``dt``: time since the step before
+        [s], a stage without. ``budget_s``: how long it may iterate; 0: as often as ``solver`` says.
+        InputError for another shape or a number that is not finite.
+        """
+        given = {
+            "x": (np.asarray(x, dtype=np.float64), (len(self.problem.states),)),
+            "u_before": (
+                np.zeros(len(self.problem.inputs))
+                if u_before is None
+                else np.asarray(u_before, dtype=np.float64),
+                (len(self.problem.inputs),),
+            ),
+            "stages": (self._rows(stages), self._shape),
+        }
+        for name, (array, shape) in given.items():
+            if array.shape != shape or not np.isfinite(array).all():
+                raise InputError(
+                    f"{name}: an array of shape {array.shape}, expected {shape} with finite numbers"
+                )
+        (start, _), (before, _), (rows, _) = given.values()
+        status = self.native.solve(start, before, rows, elapsed_s=dt, budget_s=budget_s)
+        info: Any = self.native.info
+        plan, plan_u = self.native.read_plan()
+        return Solution(
+            self.native.u.copy(), plan.copy(), plan_u.copy(), Status(int(status)),
+            float(info.cost), int(info.iterations), float(info.total_us),
+        )  # fmt: skip
+
+    def _rows(self, stages: ArrayLike) -> Floats:
+        rows = np.asarray(stages, dtype=np.float64)
+        return np.broadcast_to(rows, self._shape).copy() if rows.ndim == 1 else rows

@@ -1,0 +1,168 @@
+"""The closed loop of controller and car, and what it leaves: laps, arrays, a table, a picture."""
+
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from bayesrace.api.controller import Controller
+from bayesrace.api.simulator import OwnSimulator, OwnVehicle, Simulator
+from bayesrace.api.values import State, optional
+from bayesrace.arrays import Floats
+from bayesrace.errors import InputError
+from bayesrace.log import LogWriter
+from bayesrace.operation.closed_loop import ClosedLoop, Driven
+from bayesrace.raceline import RaceLine
+from bayesrace.sensors import EXACT
+from bayesrace.vehicles import car_text
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["Run", "drive"]
+
+_COLUMNS: Final = ("x", "y", "psi", "vx", "vy", "omega", "delta")
+
+
+def drive(
+    controller: Controller,
+    simulator: "Simulator | OwnSimulator",
+    laps: int = 2,
+    *,
+    x0: "State | ArrayLike | None" = None,
+    max_time_s: float | None = None,
+    log: Path | str | None = None,
+) -> "Run":
+    """Drives until the laps are done (0: no limit), or the time is up.
+
+    Everything happens in simulated time in this process: the run is equal, to the bit, to one of a
+    controller and a plant process in lockstep. ``x0``: start state (7,); the start line at walking
+    pace without. ``max_time_s``: three times the racing line's time for so many laps, and 2 s,
+    without. ``log``: file for a recording (MCAP), which :class:`bayesrace.Log` opens.
+
+    InputError for what cannot be driven; what a simulator of one's own raises passes through.
+    """
+    if laps < 0 or (laps == 0 and max_time_s is None):
+        raise InputError(f"laps = {laps}: give a number from 1 on, or 0 and max_time_s")
+    car, track = controller.car, controller.track
+    disturbed: dict[str, Any] = {"sensors": EXACT, "seed": 0, "delay_s": 0.0}
+    if isinstance(simulator, Simulator):
+        vehicle = simulator.vehicle
+        disturbed = {name: getattr(simulator, name) for name in disturbed}
+    else:
+        vehicle = OwnVehicle(simulator, car, track)
+    about = {"drive": {"car": car_text(car), "track": track.name}}
+    writer = None if log is None else LogWriter(Path(log), about)
+    loop = ClosedLoop(
+        car, track, controller.line, controller.predictive, vehicle, writer,
+        controller.cycle_settings, **disturbed,
+    )  # fmt: skip
+    try:
+        driven = loop.drive(laps, max_time_s, x0=x0 if x0 is None else list(State.of(x0)))
+    finally:
+        controller.reset()
+        if writer is not None:
+            writer.close()
+    return Run(driven, controller.line)
+
+
+class Run:
+    """What was driven: true states, inputs and decisions, one row a sampling period."""
+
+    def __init__(self, driven: Driven, line: RaceLine) -> None:
+        self.driven = driven
+        """The same as the command line has it."""
+        self.line = line
+        """What was followed."""
+
+    @property
+    def t(self) -> Floats:
+        """Time of each state [s], shape (n,)."""
+        return self.driven.time_s
+
+    @property
+    def x(self) -> Floats:
+        """True states in the order of :class:`.State`, shape (n, 7)."""
+        return self.driven.x
+
+    @property
+    def u(self) -> Floats:
+        """Inputs that acted from each state to the next, shape (n - 1, 2)."""
+        return self.driven.u
+
+    @property
+    def laps(self) -> tuple[float, ...]:
+        """Lap times [s], the first from the start state; interpolated at the line."""
+        return self.driven.laps_s
+
+    @property
+    def off_track_m(self) -> Floats:
+        """How far the car's centre is outside the track at each counted state; negative inside."""
+        return self.driven.off_track_m
+
+    @property
+    def off_track(self) -> int:
+        """States up to the end of the last lap, or of a run without one, that are off the track."""
+        return int((self.off_track_m > 0).sum())
+
+    @property
+    def status(self) -> NDArray[np.int64]:
+        """:class:`bayesrace.Status` of the steps, shape (n - 1,)."""
+        return self.driven.statuses
+
+    @property
+    def level(self) -> NDArray[np.int64]:
+        """Who gave the inputs: :class:`bayesrace.Level`, shape (n - 1,)."""
+        return self.driven.levels
+
+    @property
+    def end(self) -> str:
+        """Why the run ended, a sentence."""
+        return self.driven.end.text
+
+    @property
+    def weights_version(self) -> str:
+        """Of the weights that drove; empty without any."""
+        return self.driven.weights_version
+
+    @cached_property
+    def _columns(self) -> dict[str, Any]:
+        """By name, a row for each state; what is not known of the last one is NaN or -1."""
+        count, u = len(self.t), np.full((len(self.t), 2), np.nan)
+        u[: len(self.u)] = self.u
+        columns: dict[str, Any] = {"t": self.t}
+        columns |= dict(zip(_COLUMNS, self.x.T, strict=True))
+        columns |= {"d": u[:, 0], "delta_rate": u[:, 1], "lap": self.driven.lap}
+        for name in ("status", "level"):
+            column = np.full(count, -1, dtype=np.int64)
+            known = getattr(self, name)[:count]
+            column[: len(known)] = known
+            columns[name] = column
+        projected = self.driven.track.project_path(self.x[:, :2])
+        return columns | {"s_m": projected.s_m, "off_track_m": projected.off_track_m}
+
+    def frame(self) -> Any:
+        """A pandas DataFrame with a row for each state: t, the state, the input that acted from
+        then on, lap, status, level, place along the track, and how far off it is.
+
+        InputError if pandas is not installed.
+        """
+        return optional("pandas", "campaign").DataFrame(self._columns)
+
+    def plot(self) -> "Figure":
+        """A matplotlib figure: the last lap on the track by speed, and speed and inputs over the
+        way. InputError if matplotlib is not installed."""
+        optional("matplotlib", "race")
+        from bayesrace.api.picture import run_figure
+
+        return run_figure(self)
+
+    def _repr_png_(self) -> bytes:
+        from bayesrace.operation.report.style import png
+
+        return png(self.plot())
+
+    def __repr__(self) -> str:
+        return f"<Run of '{self.driven.car.name}' on '{self.driven.track.name}': {self.driven}>"
