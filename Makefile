@@ -25,14 +25,15 @@ PROJECT := --no-build-isolation --editable
 START := $(shell date +%s)
 TOOK = echo "make $@: $$(($$(date +%s) - $(START))) s"
 
-.PHONY: help race paper test check tools rest lint coverage bench hashes release clean
+.PHONY: help race paper test check tools rest lint docs coverage bench hashes release clean
 
 help:
 	@echo "make race    set up, and drive the whole comparison; leaves runs/DATE-TIME"
 	@echo "make paper   every figure and number of the paper on one page: runs/paper/paper.html"
 	@echo "make test    set up for testing, and run most tests, in a few minutes"
-	@echo "make check   everything: lint, all tests, coverage; names the tools that it needs"
+	@echo "make check   everything: lint, docs, all tests, coverage; names the tools that it needs"
 	@echo "make lint    ruff, clang-format, mypy, import contracts"
+	@echo "make docs    the documentation as a site: build/site/index.html"
 	@echo "make bench   time the compiled step beside CasADi + IPOPT"
 	@echo "make hashes  write constraints.hashed.txt, after a change of constraints.txt"
 	@echo "make release wheel, source, list of packages (SBOM) and checksums: build/release"
@@ -72,6 +73,7 @@ check: export TEST_SESSION = $(CURDIR)/build/session
 check: tools $(VENV)/.ready-dev
 	@rm -rf build/coverage build/session
 	@$(MAKE) --no-print-directory lint
+	@$(MAKE) --no-print-directory docs
 	$(BIN)/python -m benchmarks.numbers check
 	@$(MAKE) --no-print-directory test RUNNER='$(RUNNER)'
 	@$(MAKE) --no-print-directory rest RUNNER='$(RUNNER)'
@@ -98,6 +100,11 @@ lint: $(VENV)/.ready-dev
 	$(BIN)/clang-format --dry-run -Werror $$(git ls-files '*.c' '*.h')
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+
+# The theme would advertise its successor.
+docs: export NO_MKDOCS_2_WARNING = 1
+docs: $(VENV)/.ready-dev
+	$(BIN)/mkdocs build --strict --quiet
 
 # Of the files of all platforms, no host is named.
 hashes: $(VENV)/.ready-dev

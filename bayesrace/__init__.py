@@ -8,10 +8,12 @@
     controller = br.Controller(car, track, line)
     run = br.drive(controller, br.Simulator(car, track), laps=2)
     controller.weights = br.train(run)
-    print(br.drive(controller, br.Simulator(car, track), laps=2).laps)
+    learned = br.drive(controller, br.Simulator(car, track), laps=2)
+    print(run.laps, learned.laps)
+    learned.plot().savefig("learned.png")
 
 What ``__all__`` names is public, and nothing else; it is imported when it is first used.
-docs/python.md begins with it.
+docs/index.md explains each line.
 """
 
 from typing import TYPE_CHECKING, Any, Final
@@ -19,6 +21,7 @@ from typing import TYPE_CHECKING, Any, Final
 if TYPE_CHECKING:
     from bayesrace.api import gym as gym
     from bayesrace.api import ocp as ocp
+    from bayesrace.api import testing as testing
     from bayesrace.api.controller import Controller as Controller
     from bayesrace.api.controller import Status as Status
     from bayesrace.api.controller import Step as Step
@@ -40,6 +43,7 @@ if TYPE_CHECKING:
     from bayesrace.errors import InputError as InputError
     from bayesrace.gp.weights import Weights as Weights
     from bayesrace.raceline import RaceLine as RaceLine
+    from bayesrace.raceline import RaceLineSettings as RaceLineSettings
     from bayesrace.raceline import racing_line as racing_line
     from bayesrace.tracks import Track as Track
     from bayesrace.vehicles import Car as Car
@@ -50,11 +54,13 @@ _PLACES: Final = {
     "Car": "vehicles", "Controller": "api.controller", "Drive": "api.training",
     "Input": "api.values", "InputError": "errors", "Level": "controller.driver", "Log": "api.logs",
     "Mpc": "api.mpc", "OwnSimulator": "api.simulator", "Problem": "codegen.problems.problem",
-    "RaceLine": "raceline", "Run": "api.runs", "Simulator": "api.simulator",
-    "Solution": "api.mpc", "State": "api.values", "Status": "api.controller",
+    "RaceLine": "raceline", "RaceLineSettings": "raceline", "Run": "api.runs",
+    "Simulator": "api.simulator", "Solution": "api.mpc", "State": "api.values",
+    "Status": "api.controller",
     "Step": "api.controller", "Times": "api.controller", "Track": "tracks",
     "Weights": "gp.weights", "drive": "api.runs", "gym": "api", "ocp": "api",
-    "racing_line": "raceline", "residuals": "api.training", "train": "api.training",
+    "racing_line": "raceline", "residuals": "api.training", "testing": "api",
+    "train": "api.training",
 }  # fmt: skip
 """The module of each public name."""
 
@@ -69,17 +75,33 @@ def __getattr__(name: str) -> Any:
         return _version()
     if name not in _PLACES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    found = import_module(f"{__name__}.{_PLACES[name]}")
-    if _PLACES[name] == "api":
+    place = _PLACES[name]
+    if place.startswith("api") and name != "testing":
+        _check_packages()
+    if place == "api":  # a module
         found = import_module(f"{__name__}.api.{name}")
     else:
-        found = getattr(found, name)
+        found = getattr(import_module(f"{__name__}.{place}"), name)
     globals()[name] = found
     return found
 
 
 def __dir__() -> list[str]:
     return sorted(__all__)
+
+
+def _check_packages() -> None:
+    """InputError on a host that only controls, which has not all that this interface needs."""
+    from importlib.util import find_spec
+
+    from bayesrace.errors import InputError
+
+    for package in ("casadi", "mcap", "scipy"):
+        if find_spec(package) is None:
+            raise InputError(
+                f"the Python interface needs {package}, which is not installed: "
+                "pip install 'bayesrace[race]'"
+            )
 
 
 def _version() -> str:

@@ -46,9 +46,13 @@ class Level(IntEnum):
     """Where the input came from; see controller/native/br_fallback.c."""
 
     SOLUTION = 0
+    """Of this step."""
     SHIFTED_PLAN = 1
+    """The plan of a step before, driven on."""
     BRAKE = 2
+    """Braking along the line."""
     STOP = 3
+    """Standing still."""
 
 
 class Phase(StrEnum):

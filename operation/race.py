@@ -52,7 +52,7 @@ from bayesrace.tracks import load_track
 from bayesrace.transport import RefusedError
 from bayesrace.vehicles import write_car
 
-__all__ = ["RaceError", "race"]
+__all__ = ["RaceError", "plant_options", "race"]
 
 _MODELS: Final[tuple[PredictionModel, ...]] = ("e_kinematic", "dynamic")
 """Of BayesRace and of BestCase."""
@@ -124,7 +124,7 @@ def _compare(settings: RaceSettings, out: Path, stages: Stages) -> Recording:
     about = {"race": {"settings": settings.model_dump_json()}}
     name, lockstep = settings.driven_car.name, settings.mode == "lockstep"
     with (
-        started_system(name, out, _plant_options(copied, out), lockstep=lockstep) as system,
+        started_system(name, out, plant_options(copied, out), lockstep=lockstep) as system,
         Recorder(system.recording, name, out / _LOG, about) as recorder,
         _faults_named(InputError),
     ):
@@ -229,8 +229,8 @@ def _kept(track: PreparedTrack, out: Path, label: str) -> PreparedTrack:
     return PreparedTrack(track.track, track.line, *files)
 
 
-def _plant_options(settings: RaceSettings, out: Path) -> list[str]:
-    """Of ``bayesrace plant``."""
+def plant_options(settings: RaceSettings, out: Path) -> list[str]:
+    """Of ``bayesrace plant``, with the files in ``out`` that they name; the car's is there."""
     files = ("--fmu", settings.fmu), ("--map", settings.fmu_map)
     sensors, changes = out / _SENSORS, settings.changes
     if changes.root:

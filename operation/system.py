@@ -12,8 +12,8 @@ import os
 import signal
 import subprocess
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, Final
 
@@ -34,10 +34,13 @@ from bayesrace.transport import (
     private_endpoints,
 )
 
-__all__ = ["Child", "System", "child", "endings", "started_system"]
+__all__ = ["Child", "System", "child", "endings", "private_network", "started_system"]
 
 CONFIGURATION: Final = "bayesrace.toml"
 """What the processes of a system read, in its folder."""
+
+_CLI: Final = "bayesrace.operation.cli"
+_COMMAND: Final = "bayesrace.operation.command"
 
 _START_S: Final = 60.0
 """Time for a process to start on a machine that is busy."""
@@ -49,9 +52,7 @@ _PATIENCE_S: Final = 3.0
 class Child:
     """A running ``bayesrace`` subcommand, or other module, whose output goes to a file."""
 
-    def __init__(
-        self, arguments: list[str], output: Path, module: str = "bayesrace.operation.cli"
-    ) -> None:
+    def __init__(self, arguments: list[str], output: Path, module: str = _CLI) -> None:
         self.output = output
         self._file = output.open("ab")
         self._process = subprocess.Popen(
@@ -100,9 +101,7 @@ class Child:
 
 
 @contextmanager
-def child(
-    arguments: list[str], output: Path, module: str = "bayesrace.operation.cli"
-) -> Iterator[Child]:
+def child(arguments: list[str], output: Path, module: str = _CLI) -> Iterator[Child]:
     """A child process that does not outlive the block, however the block ends.
 
     With ``--parent-pid`` among the arguments it does not outlive this process either.
@@ -114,6 +113,15 @@ def child(
         process.stop()
 
 
+def _part(
+    name: str, options: Sequence[str], output: Path, own: Mapping[str, Sequence[str]]
+) -> AbstractContextManager[Child]:
+    """A plant or a controller for a block: ours with these options, or the user's own command."""
+    if command := own.get(name):
+        return child([str(os.getpid()), *command], output, _COMMAND)
+    return child([name, *options], output)
+
+
 def endings(children: Iterable[Child]) -> list[str]:
     """Of those that have ended, how."""
     return [f"{one.output.stem} {why}" for one in children if (why := one.ended())]
@@ -123,9 +131,16 @@ class System:
     """One plant, one controller at a time, and the sessions that direct and record them."""
 
     def __init__(
-        self, session: Any, recording: Any, car: str, folder: Path, options: Sequence[str]
+        self,
+        session: Any,
+        recording: Any,
+        car: str,
+        folder: Path,
+        options: Sequence[str],
+        own: Mapping[str, Sequence[str]] | None = None,
     ) -> None:
-        """``folder`` receives the output of the processes; ``options`` are those of both."""
+        """``folder`` receives the output of the processes; ``options`` are those of both, and
+        ``own`` as in :func:`started_system`."""
         self.session = session
         """Directs; for requests of any size."""
         self.recording = recording
@@ -133,7 +148,7 @@ class System:
         self.director = Director(session, car)
         self.children: dict[str, Child] = {}
         """The processes by what they are, plant and controller."""
-        self._folder, self._options = folder, list(options)
+        self._folder, self._options, self._own = folder, list(options), own or {}
         self._car = car
         self._events: Publisher[Event] = Publisher(recording, EVENT, car, "race")
 
@@ -144,8 +159,8 @@ class System:
         ``options`` are those of ``bayesrace controller`` beside the configuration.
         InputError, with the last message of a process that has ended, if they do not get ready.
         """
-        line = ["controller", *options, *self._options]
-        with child(line, self._folder / log) as process:
+        line = [*options, *self._options]
+        with _part("controller", line, self._folder / log, self._own) as process:
             self.children["controller"] = process
             with self.explained():
                 self._wait_for_both()
@@ -212,6 +227,7 @@ def started_system(
     configuration: Configuration | None = None,
     *,
     lockstep: bool = False,
+    own: Mapping[str, Sequence[str]] | None = None,
 ) -> Iterator[System]:
     """A running plant for the block, and the sessions that direct and record it.
 
@@ -219,19 +235,21 @@ def started_system(
     those of plant and controllers. ``configuration`` is that of all three; without it they meet at
     sockets in a folder of this user's own, without certificates, and all else is as configured. It
     is left in ``folder``.
-    ``lockstep``: all runs are in lockstep, and their links without priorities. No process outlives
-    the block, however it ends.
+    ``lockstep``: all runs are in lockstep, and their links without priorities. ``own``: commands to
+    start in place of ``bayesrace plant`` and ``bayesrace controller``, by those names; they get no
+    options beside their own. No process outlives the block, however it ends.
     """
     file = folder / CONFIGURATION
     options = ["--config", str(file), "--parent-pid", str(os.getpid()), *both]
     if lockstep:
         options.append("--low-latency")
-    line = ["plant", *plant, *options]
     with ExitStack() as stack:
-        used = configuration or stack.enter_context(_private_network())
+        used = configuration or stack.enter_context(private_network())
         write_whole(file, as_toml(used))
         endpoints = used.endpoints("director")
-        process = stack.enter_context(child(line, folder / "plant.log"))
+        process = stack.enter_context(
+            _part("plant", [*plant, *options], folder / "plant.log", own or {})
+        )
         recording = session = stack.enter_context(
             open_session(endpoints, "director", peers_follow=True)
         )
@@ -239,13 +257,13 @@ def started_system(
             fast = endpoints.model_copy(update={"low_latency": True})
             recording = stack.enter_context(open_session(fast, "director", peers_follow=True))
         stack.callback(process.stop)  # before the sessions, so that its end is seen
-        system = System(session, recording, car, folder, options)
+        system = System(session, recording, car, folder, options, own)
         system.children["plant"] = process
         yield system
 
 
 @contextmanager
-def _private_network() -> Iterator[Configuration]:
+def private_network() -> Iterator[Configuration]:
     """The configuration of processes that meet at sockets which only this user can reach."""
     with private_endpoints("plant", "controller") as (plant, controller):
         yield configured().plain(plant, controller)

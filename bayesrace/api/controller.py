@@ -78,6 +78,7 @@ class Step:
     tube: Floats
     """Standard deviation of the car's place across the plan at stages 1 to N [m], shape (N,)."""
     status: Status
+    """What became of the optimisation problem."""
     level: Level
     """Who gave the input: the solution, the plan before, the fallback's braking, or stop."""
     fault: str
@@ -127,8 +128,12 @@ class Controller:
         from bayesrace.codegen.build import build
         from bayesrace.codegen.settings import BuildSettings
 
-        self.car, self.track = car, track
+        self.car = car
+        """Whose limits hold."""
+        self.track = track
+        """Where it is driven."""
         self.line = line if line is not None else racing_line(track, car)
+        """What is followed."""
         _check_direction(self.line, track)
         check_line(self.line, track, car, "the racing line")
         named = {"problem": problem} if isinstance(problem, str) else {}
@@ -141,9 +146,10 @@ class Controller:
                 BuildSettings, {"car": car, "model": model, "horizon": horizon} | named
             )
         tuned = validated(MpcSettings, dict(settings or {}))
-        self._folder, _ = build(wanted, problem=own)
+        self.artefact, _ = build(wanted, problem=own)
+        """Folder of the compiled controller, as ``bayesrace build`` names it."""
         self.predictive: PredictiveController = compiled_controller(
-            self._folder, car, track, self.line, None, tuned, parameters=parameters
+            self.artefact, car, track, self.line, None, tuned, parameters=parameters
         )
         """What a process and :func:`bayesrace.drive` drive by."""
         compensation = {} if delay_s is None else {"mode": "fixed", "delay_s": delay_s}
@@ -186,7 +192,7 @@ class Controller:
                 "Weights.from_sklearn returns"
             )
         else:
-            checks = Checks(GateSettings(), self._folder, self.car)
+            checks = Checks(GateSettings(), self.artefact, self.car)
             recent = Samples(*self.native.samples())
             packed = checks.check_start(encode_weights(weights), recent)
             self.native.load_weights(packed, weights.version)

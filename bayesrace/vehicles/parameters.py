@@ -95,7 +95,8 @@ class Car(Part):
     """One car; symbols as in docs/equations.md."""
 
     name: str = Field(
-        pattern=r"^[A-Za-z0-9_-]{1,40}$", description="in message keys: letters, digits, '-', '_'"
+        pattern=r"^[A-Za-z0-9_-]{1,40}$",
+        description="name, part of message keys: letters, digits, '-', '_'",
     )
     lf_m: float = Field(gt=0, description="centre of gravity to front axle [m]")
     lr_m: float = Field(gt=0, description="centre of gravity to rear axle [m]")
@@ -103,7 +104,9 @@ class Car(Part):
     inertia_kgm2: float | None = Field(
         None, gt=0, description="yaw moment of inertia Iz, for simulations of the car [kg m^2]"
     )
-    tyres: Tyres | None = Field(None, description="the tyres, by their model; likewise")
+    tyres: Tyres | None = Field(
+        None, description="the tyres, by their model, for simulations of the car"
+    )
     drive: Drive = Field(description="the drive, by its model")
     d_min: float = Field(lt=0, description="lowest drive command, which brakes [command]")
     d_max: float = Field(gt=0, description="highest drive command [command]")

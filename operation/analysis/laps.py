@@ -22,11 +22,13 @@ from bayesrace.vehicles import Car
 
 __all__ = [
     "Cycles",
+    "DrivenLaps",
     "LapTimes",
     "Trajectory",
     "Verdict",
     "judge",
     "judge_log",
+    "laps_in",
     "positions_between",
     "time_laps",
     "trajectory_digest",
@@ -255,8 +257,17 @@ def judge(
     return Verdict(True, f"passed: {done}, on the track throughout ({cycles})")
 
 
-def judge_log(log: Path, run: int, track: Track, asked: int) -> Verdict:
-    """Judges a run in a log."""
+class DrivenLaps(NamedTuple):
+    """What a run in a log is judged by, in the order in which :func:`judge` takes it."""
+
+    samples: Columns
+    off_track_m: Floats
+    laps: LapTimes
+    cycles: Cycles
+
+
+def laps_in(log: Path, run: int, track: Track) -> DrivenLaps:
+    """What a run in a log was; InputError if there is no log."""
     wanted: dict[Topic[Any], str] = {STATE: STATES, TRUTH: TRUE_STATES, TELEMETRY: CYCLES}
     columns = LogColumns(log, wanted).read()
     states, truth, telemetry = (columns[one][columns[one]["run"] == run] for one in wanted)
@@ -264,4 +275,9 @@ def judge_log(log: Path, run: int, track: Track, asked: int) -> Verdict:
     projected = track.project_path(known["x"][:, :2])
     laps = time_laps(track, known["time_s"], known["x"][:, :2], projected.s_m)
     counted = laps.after[-1] if laps.after else len(known)
-    return judge(known, projected.off_track_m[:counted], laps, Cycles(telemetry), asked)
+    return DrivenLaps(known, projected.off_track_m[:counted], laps, Cycles(telemetry))
+
+
+def judge_log(log: Path, run: int, track: Track, asked: int) -> Verdict:
+    """Judges a run in a log."""
+    return judge(*laps_in(log, run, track), asked)

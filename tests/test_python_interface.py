@@ -1,0 +1,456 @@
+"""``import bayesrace``: car, track, controller, simulator, closed loop, training, recordings."""
+
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from sklearn.gaussian_process import GaussianProcessRegressor
+from sklearn.gaussian_process.kernels import (
+    RBF,
+    ConstantKernel,
+    DotProduct,
+    Matern,
+    RationalQuadratic,
+    WhiteKernel,
+)
+
+import bayesrace as br
+from bayesrace.arrays import Floats
+from bayesrace.controller.assembly import compiled_controller
+from bayesrace.operation.closed_loop import ClosedLoop
+from tests import public_interface
+
+
+@pytest.fixture(scope="module")
+def orca() -> br.Car:
+    return br.Car.load("orca")
+
+
+@pytest.fixture(scope="module")
+def harbour() -> br.Track:
+    return br.Track.load("harbour")
+
+
+@pytest.fixture(scope="module")
+def controller(orca: br.Car, harbour: br.Track) -> br.Controller:
+    return br.Controller(orca, harbour)
+
+
+@pytest.fixture(scope="module")
+def first(controller: br.Controller) -> br.Run:
+    """Without a correction; the car leaves the track, which it learns from."""
+    simulator = br.Simulator(controller.car, controller.track)
+    return br.drive(controller, simulator, laps=0, max_time_s=8.0)
+
+
+@pytest.fixture(scope="module")
+def weights(first: br.Run) -> br.Weights:
+    return br.train(first, points=200)
+
+
+@pytest.fixture(autouse=True)
+def _as_new(request: pytest.FixtureRequest) -> None:
+    """No test sees the weights or the run of the one before."""
+    if "controller" in request.fixturenames:
+        controller = request.getfixturevalue("controller")
+        controller.weights = None
+        controller.reset()
+
+
+# What is public -----------------------------------------------------------------------------------
+
+
+def test_nothing_becomes_public_by_accident() -> None:
+    """After a change that is meant: python -m tests.public_interface"""
+    assert public_interface.LISTED.read_text() == public_interface.described()
+
+
+def test_the_package_imports_what_is_used_and_no_zenoh() -> None:
+    blocked = (
+        "import sys; sys.modules['zenoh'] = None\n"
+        "import bayesrace as br\n"
+        "assert set(br.__all__) <= set(dir(br))\n"
+        "print(sorted({'numpy', 'casadi', 'pydantic'} & set(sys.modules)))\n"
+        "br.Controller, br.Simulator, br.drive, br.train, br.Log, br.Mpc, br.ocp\n"
+        "print('bayesrace.transport' in sys.modules)"
+    )
+    said = subprocess.check_output([sys.executable, "-c", blocked], text=True)
+    assert said.split() == ["[]", "False"]
+
+
+# A loop of one's own ------------------------------------------------------------------------------
+
+
+def test_a_loop_of_ones_own_is_the_closed_loop_to_the_bit(
+    controller: br.Controller, weights: br.Weights
+) -> None:
+    """Which in turn is that of the processes: test_closed_loop."""
+    controller.weights = weights
+    simulator = br.Simulator(controller.car, controller.track)
+    run = br.drive(controller, simulator, laps=1)
+    state = simulator.reset()
+    for x, u in zip(run.x[:-1], run.u, strict=True):
+        assert (state.to_numpy() == x).all()
+        out = controller.step(state, dt=0.02, u_applied=simulator.u_applied)
+        state = simulator.step(out.u)
+        assert (simulator.u_applied.to_numpy() == u).all()
+    assert (state.to_numpy() == run.x[-1]).all()
+
+
+def test_a_run_is_that_of_a_race_to_the_bit(
+    controller: br.Controller, weights: br.Weights, kinematic_artefact: Path
+) -> None:
+    """Of its artefact and settings, put together as ``race`` does."""
+    controller.weights = weights
+    simulator = br.Simulator(controller.car, controller.track)
+    run = br.drive(controller, simulator, laps=1)
+    car, track, line = controller.car, controller.track, controller.line
+    raced = compiled_controller(kinematic_artefact, car, track, line, weights)
+    other = ClosedLoop(car, track, line, raced).drive(1)
+    assert (run.x == other.x).all()
+    assert run.laps == other.laps_s
+    assert run.off_track == 0
+
+
+def test_a_step_tells_plan_tube_level_and_times(
+    controller: br.Controller, weights: br.Weights
+) -> None:
+    controller.weights = weights
+    simulator = br.Simulator(controller.car, controller.track)
+    state, out = simulator.state, None
+    for _ in range(20):
+        out = controller.step(state)
+        state = simulator.step(out.u)
+    assert out is not None
+    assert (out.status, out.level, out.fault) == (br.Status.CONVERGED, br.Level.SOLUTION, "")
+    assert (out.plan.shape, out.plan_u.shape, out.tube.shape) == ((21, 7), (20, 2), (20,))
+    assert np.allclose(out.plan_u[0], out.u)
+    assert np.allclose(out.plan[1], state, atol=0.02)
+    assert 0 < out.tube.max() < 0.5
+    assert 0 < out.times.solve < 1e5 > out.times.prepare > 0
+    kept = out.plan.copy()
+    controller.step(state)
+    assert (out.plan == kept).all()  # it is the caller's
+
+
+def test_without_a_state_the_car_is_driven_on_then_braked(controller: br.Controller) -> None:
+    simulator = br.Simulator(controller.car, controller.track)
+    state = simulator.state
+    for _ in range(10):
+        state = simulator.step(controller.step(state).u)
+    levels = [controller.step(None).level for _ in range(12)]
+    assert levels[0] < br.Level.BRAKE <= levels[-1]
+
+
+def test_a_known_delay_is_compensated(orca: br.Car, harbour: br.Track) -> None:
+    """By the constant, and by what a step is told of the one before."""
+    simulator = br.Simulator(orca, harbour)
+    at_speed = br.State(*harbour.start_pose(), 1.0, 0.0, 0.0, 0.0)
+    constant = br.Controller(orca, harbour, delay_s=0.04)
+    told = br.Controller(orca, harbour)
+    for one, delay_s, wanted_s in ((constant, None, 0.04), (told, 0.04, 0.04), (told, 0.0, 0.0)):
+        one.reset()
+        state = simulator.step(one.step(simulator.reset(at_speed)).u)
+        ahead = one.step(state, delay_s=delay_s).plan[0, :2] - state.to_numpy()[:2]
+        assert np.linalg.norm(ahead) == pytest.approx(wanted_s * state.vx, rel=0.15, abs=1e-9)
+
+
+def test_both_problems_and_the_perfect_model_drive(orca: br.Car, harbour: br.Track) -> None:
+    best = br.Controller(orca, harbour, model="dynamic")
+    limit = br.Controller(orca, harbour, problem="progress", model="dynamic")
+    simulator = br.Simulator(orca, harbour)
+    laps = [br.drive(one, simulator, laps=2).laps for one in (best, limit)]
+    assert laps[1][1] < laps[0][1] < 6.7
+
+
+# A simulator of one's own -------------------------------------------------------------------------
+
+
+class Own:
+    """The equations again, behind ``reset`` and ``step``."""
+
+    def __init__(self, car: br.Car, track: br.Track) -> None:
+        self._car = br.Simulator(car, track)
+
+    def reset(self, x0: Floats) -> Any:
+        return self._car.reset(x0)
+
+    def step(self, u: Floats) -> Any:
+        return self._car.step(u).to_numpy()  # a state or an array
+
+
+def test_a_simulator_of_ones_own_is_driven(controller: br.Controller, weights: br.Weights) -> None:
+    controller.weights = weights
+    own = br.drive(controller, Own(controller.car, controller.track), laps=1)
+    run = br.drive(controller, br.Simulator(controller.car, controller.track), laps=1)
+    # What the actuators clip by rounding is not reported back.
+    assert own.laps == pytest.approx(run.laps, abs=1e-6)
+
+
+def test_what_a_simulator_of_ones_own_raises_passes_through(controller: br.Controller) -> None:
+    class Broken(Own):
+        def step(self, u: Floats) -> Any:
+            raise KeyError("engine")
+
+    with pytest.raises(KeyError, match="engine"):
+        br.drive(controller, Broken(controller.car, controller.track))
+    simulator = br.Simulator(controller.car, controller.track)
+    assert controller.step(simulator.state).level == br.Level.SOLUTION  # it goes on
+
+
+# Runs and recordings ------------------------------------------------------------------------------
+
+
+def test_a_run_is_a_table_a_picture_and_a_recording(
+    controller: br.Controller, weights: br.Weights, tmp_path: Path
+) -> None:
+    controller.weights = weights
+    log = tmp_path / "run.mcap"
+    simulator = br.Simulator(controller.car, controller.track)
+    run = br.drive(controller, simulator, laps=1, log=log)
+    frame = run.frame()
+    assert frame.columns[:8].tolist() == ["t", *["x", "y", "psi", "vx", "vy", "omega", "delta"]]
+    assert len(frame) == len(run.t) == len(run.x)
+    assert (frame[["d", "delta_rate"]].to_numpy()[:-1] == run.u).all()
+    assert (frame.status[:-1] == 0).all()
+    assert frame.off_track_m.max() < 0
+    figure = run.plot()
+    assert len(figure.axes) == 5
+    figure.savefig(tmp_path / "run.png")
+    assert repr(run).startswith("<Run of 'orca' on 'harbour': ")
+
+    read = br.Log(log)
+    assert {"state", "truth", "actuation", "telemetry", "event"} <= set(read.topics)
+    assert (read["state"]["x"] == run.x).all()
+    assert read["state"]["time_s"] == pytest.approx(run.t)
+    assert read.frame("telemetry").fallback.max() == 0
+    assert read.table("state").column("x.3").to_pylist() == run.x[:, 3].tolist()
+    assert read.car == controller.car
+    assert br.train(read, points=60).counts == br.train(run, points=60).counts
+    with pytest.raises(br.InputError, match="no topic 'states': there are state, truth"):
+        read["states"]
+
+
+def test_arrays_teach_what_a_run_does(first: br.Run, orca: br.Car) -> None:
+    z, y = br.residuals(first)
+    drive = br.Drive(first.x, first.u, 0.02)
+    features, errors = br.residuals(drive, orca)
+    assert len(z) < len(features)  # a run knows which of its cycles the fallback drove
+    assert {tuple(row) for row in z} <= {tuple(row) for row in features}
+    assert y.shape == (len(z), 3)
+    assert errors.shape == (len(features), 3)
+
+
+def test_an_update_goes_on_from_earlier_weights(first: br.Run, weights: br.Weights) -> None:
+    again = br.train(first, points=200, initial=weights)
+    assert again.kernels == weights.kernels
+
+
+# Weights and scikit-learn -------------------------------------------------------------------------
+
+
+def test_weights_are_scikit_learns_and_back(weights: br.Weights, first: br.Run) -> None:
+    z, _ = br.residuals(first)
+    regressors = weights.to_sklearn()
+    predicted = np.column_stack([one.predict(z) for one in regressors])
+    assert np.abs(predicted - weights.predict(z)).max() < 1e-9
+    again = br.Weights.from_sklearn(regressors, first.driven.car)
+    assert np.abs(again.predict(z) - weights.predict(z)).max() < 1e-9
+    made, given = ([one.amplitudes for one in each.outputs] for each in (again, weights))
+    assert np.allclose(made, given, rtol=1e-12, atol=0)
+
+
+KERNELS: dict[str, Any] = {
+    "rbf": ConstantKernel(2.0) * RBF(np.full(6, 2.0)) + WhiteKernel(1e-4),
+    "one length scale": RBF(2.0),
+    "matern05": ConstantKernel(0.5) * Matern(np.full(6, 4.0), nu=0.5),
+    "matern15": WhiteKernel(1e-3) + Matern(np.full(6, 3.0), nu=1.5) * ConstantKernel(3.0),
+    "matern25": ConstantKernel(2.0) * (Matern(np.full(6, 3.0), nu=2.5) + WhiteKernel(1e-3)),
+    "matern of infinite nu": Matern(np.full(6, 3.0), nu=np.inf),
+}
+
+
+def regressors(kernel: Any, first: br.Run, **options: Any) -> list[GaussianProcessRegressor]:
+    """Fitted to some 50 samples."""
+    z, y = (one[::8] for one in br.residuals(first))
+    fitted = [GaussianProcessRegressor(kernel, optimizer=None, **options) for _ in y.T]
+    return [one.fit(z, target) for one, target in zip(fitted, y.T, strict=True)]
+
+
+@pytest.mark.parametrize("name", KERNELS)
+def test_regressors_of_these_kernels_become_weights(
+    name: str, first: br.Run, controller: br.Controller
+) -> None:
+    fitted = regressors(KERNELS[name], first, normalize_y=True, alpha=1e-8)
+    weights = br.Weights.from_sklearn(fitted, controller.car, version=name)
+    z, _ = br.residuals(first)
+    predicted = np.column_stack([one.predict(z) for one in fitted])
+    assert np.abs(weights.predict(z) - predicted).max() < 1e-9
+    # The compiled variance is scikit-learn's, too, where all points count.
+    controller.native.set_weights(weights)
+    total, _ = controller.native.variance(np.concatenate([first.x[40], first.u[40]]))
+    at_40 = np.concatenate([first.x[40, 3:], first.u[40]])[None]
+    known = [float(one.predict(at_40, return_std=True)[1][0]) ** 2 for one in fitted]
+    jitter = [output.y_scale**2 * 1e-8 for output in weights.outputs]
+    assert np.allclose(total, np.add(known, jitter), rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("kernel", "options", "message"),
+    [
+        (RationalQuadratic(), {}, "the regressor of vx has a RationalQuadratic kernel"),
+        (RBF() + RBF(3.0), {}, "a sum of kernels"),
+        (RBF() * Matern(), {}, "a product of kernels"),
+        (RBF() + ConstantKernel(2.0), {}, "a constant that is added"),
+        (RBF() * DotProduct(), {}, "DotProduct"),
+        (WhiteKernel(1e-2), {}, "white noise alone"),
+        (Matern(nu=0.7), {}, "nu = 0.7: give 0.5, 1.5 or 2.5"),
+    ],
+)
+def test_other_kernels_are_refused_by_name(
+    kernel: Any, options: dict[str, Any], message: str, first: br.Run, orca: br.Car
+) -> None:
+    fitted = regressors(kernel, first, alpha=1e-6, **options)
+    with pytest.raises(br.InputError, match=message):
+        br.Weights.from_sklearn(fitted, orca)
+
+
+def test_training_by_scikit_learn_drives_as_well(first: br.Run, controller: br.Controller) -> None:
+    controller.weights = br.train(first, points=100, method="scikit-learn")
+    run = br.drive(controller, br.Simulator(controller.car, controller.track), laps=2)
+    assert run.laps[1] < 6.75
+    assert run.off_track == 0
+
+
+def test_weights_are_checked_as_published_ones_are(
+    first: br.Run, controller: br.Controller, weights: br.Weights
+) -> None:
+    other = br.Car.load("f1tenth")
+    with pytest.raises(br.InputError, match="were learned for"):
+        br.Controller(other, br.Track.load("random10:1", other), weights=weights)
+    flipped = regressors(KERNELS["rbf"], first)
+    for one in flipped:
+        one.alpha_ = -20 * one.alpha_
+    with pytest.raises(br.InputError, match=r"absurd|worse"):
+        controller.weights = br.Weights.from_sklearn(flipped, controller.car)
+    assert controller.weights is None
+    with pytest.raises(br.InputError, match="weights = str: give what"):
+        controller.weights = "weights.bin"  # type: ignore[assignment]
+
+
+# What is refused ----------------------------------------------------------------------------------
+
+
+def at(track: br.Track, **changes: float) -> list[float]:
+    x, y, psi = track.start_pose()
+    state = {"x": x, "y": y, "psi": psi, "vx": 1.0, "vy": 0.0, "omega": 0.0, "delta": 0.0}
+    return list((state | changes).values())
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"vx": float("nan")}, "state.vx = nan: give a number, or None"),
+        ({"vx": 40.0}, r"state.vx = 40 is outside .*: give metres per second, not km/h"),
+        ({"delta": 15.0}, r"state.delta = 15 is outside .*: give radians, not degrees"),
+        ({"omega": 2e3}, r"state.omega = 2000 .*: give radians per second, not degrees"),
+        ({"x": 1500.0}, r"state.x = 1500 .*: give metres, in the track's own coordinates"),
+    ],
+)
+def test_states_in_other_units_are_refused(
+    changes: dict[str, float], message: str, controller: br.Controller
+) -> None:
+    state = at(controller.track, **changes)
+    for act in (controller.step, br.Simulator(controller.car, controller.track).reset):
+        with pytest.raises(br.InputError, match=message):
+            act(state)
+
+
+def _turned(line: br.RaceLine) -> br.RaceLine:
+    return br.racing_line(br.Track.load("harbour").driven_from(reverse=True), br.Car.load("orca"))
+
+
+REFUSED: dict[str, tuple[Callable[[br.Controller], object], str]] = {
+    "shape": (lambda c: c.step([0.0] * 6), r"state: an array of shape \(6,\), expected \(7,\): x"),
+    "no state": (lambda c: c.step(None), "the first step of a run needs a state"),
+    "input": (
+        lambda c: br.Simulator(c.car, c.track).step([1.0]),
+        r"input: an array of shape \(1,\), expected \(2,\): d, delta_rate",
+    ),
+    "input not finite": (
+        lambda c: br.Simulator(c.car, c.track).step([np.nan, 0.0]),
+        "u = .*: give finite numbers",
+    ),
+    "direction": (
+        lambda c: br.Controller(c.car, c.track, _turned(c.line)),
+        "runs against the track 'harbour': turn one of them round",
+    ),
+    "line of another car": (
+        lambda c: br.Controller(c.car.model_copy(update={"friction": 0.5}), c.track, c.line),
+        "the racing line was made for a friction of",
+    ),
+    "no tyres": (
+        lambda c: br.Simulator(c.car.model_copy(update={"tyres": None}), c.track),
+        "no tyres in its file, which the simulator",
+    ),
+    "settings": (
+        lambda c: br.Controller(c.car, c.track, c.line, settings={"cautoin": 0}),
+        "unknown setting 'cautoin': did you mean 'caution'",
+    ),
+    "problem": (
+        lambda c: br.Controller(c.car, c.track, c.line, problem="racing"),
+        "problem = 'racing': ",
+    ),
+    "simulator": (
+        lambda c: br.drive(c, object()),  # type: ignore[arg-type]
+        "simulator = object: it has no reset and no step",
+    ),
+    "laps": (
+        lambda c: br.drive(c, br.Simulator(c.car, c.track), laps=0),
+        "laps = 0: give a number from 1 on, or 0 and max_time_s",
+    ),
+    "nothing to learn from": (lambda _: br.train([]), r"drives = \[\]: give at least one run"),
+    "no car": (
+        lambda _: br.train(br.Drive(np.zeros((30, 7)), np.zeros((29, 2)), 0.02)),
+        "name the",
+    ),
+    "method": (lambda _: br.train([], method="keras"), "method = 'keras': give one of"),  # type: ignore[arg-type]
+    "track": (lambda _: br.Track.load(np.zeros((5, 3))), r"shape \(5, 3\), expected \(n, 4\)"),
+    "rate": (lambda c: br.Simulator(c.car, c.track, step_s=0.0173), "cannot sample at"),
+}
+
+
+@pytest.mark.parametrize("what", REFUSED)
+def test_what_cannot_be_used_is_named_with_its_remedy(what: str, controller: br.Controller) -> None:
+    act, message = REFUSED[what]
+    controller.reset()
+    with pytest.raises(br.InputError, match=message):
+        act(controller)
+    assert issubclass(br.InputError, ValueError)
+
+
+def test_time_that_does_not_pass_is_refused(controller: br.Controller) -> None:
+    state = br.Simulator(controller.car, controller.track).state
+    controller.reset()
+    controller.step(state)
+    for dt in (0.0, -0.02, float("nan"), 20.0):
+        with pytest.raises(br.InputError, match="give seconds since the state before"):
+            controller.step(state, dt)
+
+
+def test_a_host_without_casadi_is_told_what_to_install() -> None:
+    code = (
+        "import sys; sys.modules['casadi'] = None\n"
+        "import bayesrace as br\n"
+        "br.Car.load('orca'), br.Track.load('harbour')\n"
+        "try: br.Controller\n"
+        "except br.InputError as error: print(error)"
+    )
+    said = subprocess.check_output([sys.executable, "-c", code], text=True)
+    assert said.strip() == (
+        "the Python interface needs casadi, which is not installed: pip install 'bayesrace[race]'"
+    )
