@@ -41,8 +41,6 @@ _HEADERS: Final = tuple(
     Path(__file__).parent / "controller" / "native" / name
     for name in ("bayesrace_mpc.h", "bayesrace_cycle.h")
 )
-DRIVING_PROBLEMS: Final = ("tracking", "progress")
-"""Control problems that drive a car; see ``codegen/problems``."""
 
 
 class ParameterInfo(BaseModel):
@@ -70,6 +68,7 @@ class ProblemInfo(BaseModel):
     parameters: list[ParameterInfo] = Field(description="in the order of br_mpc_parameters")
     features: list[str] = Field(description="of the residual")
     outputs: int = Field(description="of the residual")
+    follows_path: bool = Field(False, description="whether it drives a car along a line")
 
 
 class Manifest(BaseModel):
@@ -95,7 +94,7 @@ class Manifest(BaseModel):
 
     def check_car(self, car: Car, artefact: Path) -> None:
         """InputError if this artefact was built for another car, or solves another problem."""
-        if self.problem.name not in DRIVING_PROBLEMS:
+        if not self.problem.follows_path:
             raise InputError(
                 f"{artefact} solves the problem '{self.problem.name}', which drives no car: run "
                 "'bayesrace build'"

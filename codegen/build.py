@@ -294,6 +294,7 @@ def _manifest(
             parameters=[ParameterInfo(**asdict(one)) for one in problem.parameters],
             features=list(problem.features),
             outputs=problem.outputs,
+            follows_path=bool(problem.path),
         ),
         model=settings.model,
         car=car.name,

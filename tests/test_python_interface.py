@@ -1,10 +1,11 @@
 """``import bayesrace``: car, track, controller, simulator, closed loop, training, recordings."""
 
+import json
 import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -20,9 +21,9 @@ from sklearn.gaussian_process.kernels import (
 
 import bayesrace as br
 from bayesrace.arrays import Floats
-from bayesrace.controller.assembly import compiled_controller
-from bayesrace.operation.closed_loop import ClosedLoop
+from bayesrace.raceline import read_raceline
 from tests import public_interface
+from tests.programs import Race
 
 
 @pytest.fixture(scope="module")
@@ -101,19 +102,24 @@ def test_a_loop_of_ones_own_is_the_closed_loop_to_the_bit(
     assert (state.to_numpy() == run.x[-1]).all()
 
 
+@pytest.mark.parametrize("model", ["e_kinematic", "dynamic"])
 def test_a_run_is_that_of_a_race_to_the_bit(
-    controller: br.Controller, weights: br.Weights, kinematic_artefact: Path
+    model: Literal["e_kinematic", "dynamic"], peanut_race: Race
 ) -> None:
-    """Of its artefact and settings, put together as ``race`` does."""
-    controller.weights = weights
-    simulator = br.Simulator(controller.car, controller.track)
-    run = br.drive(controller, simulator, laps=1)
-    car, track, line = controller.car, controller.track, controller.line
-    raced = compiled_controller(kinematic_artefact, car, track, line, weights)
-    other = ClosedLoop(car, track, line, raced).drive(1)
-    assert (run.x == other.x).all()
-    assert run.laps == other.laps_s
-    assert run.off_track == 0
+    """What plant and controller processes drove over Zenoh, from the files that they left."""
+    out = peanut_race.out
+    name = {"e_kinematic": "bayesrace", "dynamic": "bestcase"}[model]
+    laps = json.loads((out / "result.json").read_text())["laps"]
+    number = next(one["run"] for one in laps if one["controller"] == name)
+    truth = br.Log(out / "run.mcap")["truth"]
+    raced = truth[truth["run"] == number]["x"]
+    car = br.Car.load(out / "car.toml")
+    track = br.Track.load(out / "race.csv", car)
+    controller = br.Controller(car, track, read_raceline(out / "race_raceline.csv"), model=model)
+    if model == "e_kinematic":
+        controller.weights = br.Weights.load(out / "weights-bayesrace.bin")
+    run = br.drive(controller, br.Simulator(car, track), laps=2)
+    assert (run.x == raced).all()
 
 
 def test_a_step_tells_plan_tube_level_and_times(

@@ -198,6 +198,11 @@ class Controller:
             self.native.load_weights(packed, weights.version)
         self._weights = weights
 
+    def set_parameters(self, **values: float) -> None:
+        """Changes weights and limits of the optimisation by name, such as ``margin_m``, from the
+        next step on; InputError for a name that the problem has not, or an impossible value."""
+        self.native.set_values(values)
+
     def reset(self) -> None:
         """The next state is the first of a run: nothing is known of the car's past."""
         self._driver.lost(silent=False)

@@ -20,6 +20,7 @@ from sklearn.gaussian_process.kernels import (
     Sum,
     WhiteKernel,
 )
+from threadpoolctl import threadpool_limits
 
 from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
@@ -141,7 +142,8 @@ def _regressor(output: GpOutput, name: str) -> GaussianProcessRegressor:
     kernel = covariance + WhiteKernel(output.noise_variance)
     targets = kernel(output.inputs) @ output.alpha
     made = GaussianProcessRegressor(kernel, alpha=0.0, optimizer=None)
-    made.fit(output.inputs, targets)
+    with threadpool_limits(1, "blas"):  # threads would wait for each other
+        made.fit(output.inputs, targets)
     # Found again by a factorisation, alpha would differ by its rounding.
     made.alpha_ = output.alpha.copy()
     made._y_train_mean, made._y_train_std = output.y_mean, output.y_scale
