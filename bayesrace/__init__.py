@@ -19,9 +19,9 @@ docs/index.md explains each line.
 from typing import TYPE_CHECKING, Any, Final
 
 if TYPE_CHECKING:
-    from bayesrace.api import gym as gym
-    from bayesrace.api import ocp as ocp
-    from bayesrace.api import testing as testing
+    from bayesrace import gym as gym
+    from bayesrace import ocp as ocp
+    from bayesrace import testing as testing
     from bayesrace.api.controller import Controller as Controller
     from bayesrace.api.controller import Status as Status
     from bayesrace.api.controller import Step as Step
@@ -58,11 +58,11 @@ _PLACES: Final = {
     "Simulator": "api.simulator", "Solution": "api.mpc", "State": "api.values",
     "Status": "api.controller",
     "Step": "api.controller", "Times": "api.controller", "Track": "tracks",
-    "Weights": "gp.weights", "drive": "api.runs", "gym": "api", "ocp": "api",
-    "racing_line": "raceline", "residuals": "api.training", "testing": "api",
+    "Weights": "gp.weights", "drive": "api.runs", "gym": "", "ocp": "",
+    "racing_line": "raceline", "residuals": "api.training", "testing": "",
     "train": "api.training",
 }  # fmt: skip
-"""The module of each public name."""
+"""The module of each public name; empty: it is a module itself."""
 
 __all__ = ["__version__", *_PLACES]
 
@@ -75,13 +75,11 @@ def __getattr__(name: str) -> Any:
         return _version()
     if name not in _PLACES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    place = _PLACES[name]
-    if place.startswith("api") and name != "testing":
+    if (place := _PLACES[name]).startswith("api"):
         _check_packages()
-    if place == "api":  # a module
-        found = import_module(f"{__name__}.api.{name}")
-    else:
-        found = getattr(import_module(f"{__name__}.{place}"), name)
+    if not place:
+        return import_module(f"{__name__}.{name}")
+    found = getattr(import_module(f"{__name__}.{place}"), name)
     globals()[name] = found
     return found
 

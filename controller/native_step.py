@@ -185,7 +185,20 @@ class NativeProblem:
         for name, value in values.items():
             setattr(self._parameters, name, value)
         error = self._library.br_mpc_set_parameters(self.handle, self._parameters)
-        self._check(error, "parameters")
+        if error:
+            self._check(error, f"parameters ({', '.join(self._doubtful()) or 'their limits'})")
+
+    def _doubtful(self) -> list[str]:
+        """Parameters of the problem whose values it does not allow, with those."""
+        given = [
+            (one, getattr(self._parameters, one.name)) for one in self.manifest.problem.parameters
+        ]
+        return [
+            f"{one.name} = {value:g}, which has to be "
+            + ("above 0" if one.positive else f"from {one.low:g} to {one.high:g}")
+            for one, value in given
+            if not one.low <= value <= one.high or (one.positive and not value > 0)
+        ]
 
     def _outputs(self, packed: bytes) -> Any:
         """A br_mpc_gp for each output, with its arrays where they are in ``packed``."""

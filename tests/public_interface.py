@@ -56,10 +56,11 @@ def _members(name: str, kind: type) -> list[str]:
 
 def _source(kind: type) -> str:
     """Of its ``__init__``, what is left of each assignment."""
-    if "__init__" not in vars(kind) or not inspect.isfunction(kind.__init__):
+    init = vars(kind).get("__init__")
+    if not inspect.isfunction(init):
         return ""
     try:
-        lines = inspect.getsource(kind.__init__).splitlines()
+        lines = inspect.getsource(init).splitlines()
     except OSError:  # made by a decorator
         return ""
     return "\n".join(line.partition(" = ")[0] for line in lines if " = " in line)

@@ -13,9 +13,9 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 import bayesrace as br
-from bayesrace.api.gym import ENV_ID, OBSERVED, RaceEnv
 from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
+from bayesrace.gym import ENV_ID, OBSERVED, RaceEnv
 from bayesrace.operation.analysis.laps import time_laps
 from tests.conftest import Circuit
 from tests.programs import ROOT
@@ -239,9 +239,9 @@ def test_bad_starts_and_actions_are_named(env: RaceEnv) -> None:
 
 def test_without_gymnasium_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "gymnasium", None)
-    monkeypatch.delitem(sys.modules, "bayesrace.api.gym")
+    monkeypatch.delitem(sys.modules, "bayesrace.gym")
     with pytest.raises(InputError, match=r"gymnasium.*bayesrace\[gym\]"):
-        importlib.import_module("bayesrace.api.gym")
+        importlib.import_module("bayesrace.gym")
 
 
 def test_a_picture_shows_the_car(circuit: Circuit) -> None:

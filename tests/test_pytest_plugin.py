@@ -143,7 +143,7 @@ def test_the_plugin_alone_imports_nothing(project: Project) -> None:
         "import sys\n\n\ndef test_modules(pytestconfig):\n"
         "    assert pytestconfig.pluginmanager.has_plugin('bayesrace')\n"
         "    ours = {one for one in sys.modules if one.split('.')[0] == 'bayesrace'}\n"
-        "    light = {'bayesrace.api', 'bayesrace.api.testing', 'bayesrace.errors'}\n"
+        "    light = {'bayesrace.api', 'bayesrace.testing', 'bayesrace.errors'}\n"
         "    assert ours <= {'bayesrace', *light}\n"
         "    assert not {'numpy', 'zenoh', 'casadi', 'pydantic', 'msgspec'} & {*sys.modules}\n"
     )

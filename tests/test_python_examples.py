@@ -122,7 +122,7 @@ def test_a_cart_with_a_pole(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     exact = br.Mpc(problem, cart_pole.HORIZON, cart_pole.STEP_S, values, solver=EXACT)
     learned: tuple[list[Any], ...] = ([], made["regressors"])
     for regressors in learned:
-        exact.correct(regressors)
+        exact.set_regressors(regressors)
         s = problem.symbols
         f = ca.Function("F", [s.x, s.u], [problem.f(s.x, s.u, ca.DM.zeros(2))])
         if regressors:

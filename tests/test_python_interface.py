@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
 
+import casadi as ca
 import numpy as np
 import pytest
 from sklearn.gaussian_process import GaussianProcessRegressor
@@ -23,6 +24,7 @@ import bayesrace as br
 from bayesrace.arrays import Floats
 from bayesrace.raceline import read_raceline
 from tests import public_interface
+from tests.conftest import smooth_drive
 from tests.programs import Race
 
 
@@ -137,7 +139,7 @@ def test_a_step_tells_plan_tube_level_and_times(
     assert np.allclose(out.plan_u[0], out.u)
     assert np.allclose(out.plan[1], state, atol=0.02)
     assert 0 < out.tube.max() < 0.5
-    assert 0 < out.times.solve < 1e5 > out.times.prepare > 0
+    assert 0 < out.times.solve_us < 1e5 > out.times.prepare_us > 0
     kept = out.plan.copy()
     controller.step(state)
     assert (out.plan == kept).all()  # it is the caller's
@@ -223,6 +225,7 @@ def test_a_run_is_a_table_a_picture_and_a_recording(
     assert len(frame) == len(run.t) == len(run.x)
     assert (frame[["d", "delta_rate"]].to_numpy()[:-1] == run.u).all()
     assert (frame.status[:-1] == 0).all()
+    assert set(run.fault) == {""}
     assert frame.off_track_m.max() < 0
     figure = run.plot()
     assert len(figure.axes) == 5
@@ -376,6 +379,39 @@ def test_states_in_other_units_are_refused(
             act(state)
 
 
+RAIL = {"r": 0.1}
+
+
+def rail() -> br.Problem:
+    """A mass on a rail; docs/extending.md has the whole of it."""
+    s, e = br.ocp.Symbols.of(2, 1, 1, 1), ca.SX.sym("e", 0)
+
+    def motion(h: Any) -> Any:
+        return ca.vertcat(s.x[0] + h * s.x[1] + h**2 / 2 * s.u, s.x[1] + h * s.u)
+
+    return br.Problem(
+        name="rail",
+        states=(br.ocp.State("position", "m"), br.ocp.State("speed", "m/s")),
+        inputs=(br.ocp.Input("acceleration", "m/s2"),),
+        stage_parameters=(br.ocp.Parameter("target", "m"),),
+        parameters=(br.ocp.Parameter("r", "s4", positive=True),),
+        symbols=s,
+        f=ca.Function("stage", [s.x, s.u, e], [motion(0.1)]),
+        advance=ca.Function("advance", [s.x, s.u, e, s.h], [motion(s.h)]),
+        cost=(s.x[0] - s.p) ** 2 + s.theta * s.u**2,
+        rows=(),
+        u_lower=-1.0,
+        u_upper=1.0,
+        guess=s.share,
+    )
+
+
+def drive(columns: Any = 1.0, inputs: Any = (0, 1)) -> br.Drive:
+    """An unbroken drive, its states multiplied, its inputs in this order."""
+    x, u = smooth_drive(br.Car.load("orca"), 60, 1)
+    return br.Drive(x * columns, u[:-1, inputs], 0.02)
+
+
 def _turned(line: br.RaceLine) -> br.RaceLine:
     return br.racing_line(br.Track.load("harbour").driven_from(reverse=True), br.Car.load("orca"))
 
@@ -396,11 +432,11 @@ REFUSED: dict[str, tuple[Callable[[br.Controller], object], str]] = {
         "runs against the track 'harbour': turn one of them round",
     ),
     "line of another car": (
-        lambda c: br.Controller(c.car.model_copy(update={"friction": 0.5}), c.track, c.line),
+        lambda c: br.Controller(c.car.changed(friction=0.5), c.track, c.line),
         "the racing line was made for a friction of",
     ),
     "no tyres": (
-        lambda c: br.Simulator(c.car.model_copy(update={"tyres": None}), c.track),
+        lambda c: br.Simulator(c.car.changed(tyres=None), c.track),
         "no tyres in its file, which the simulator",
     ),
     "settings": (
@@ -417,7 +453,88 @@ REFUSED: dict[str, tuple[Callable[[br.Controller], object], str]] = {
     ),
     "laps": (
         lambda c: br.drive(c, br.Simulator(c.car, c.track), laps=0),
-        "laps = 0: give a number from 1 on, or 0 and max_time_s",
+        "laps = 0: give a whole number from 1 on, or 0 and max_time_s",
+    ),
+    "laps that are no number": (
+        lambda c: br.drive(c, br.Simulator(c.car, c.track), laps=float("nan")),  # type: ignore[arg-type]
+        "laps = nan: give a whole number",
+    ),
+    "another car": (
+        lambda c: br.drive(c, br.Simulator("f1tenth", "workshop")),
+        "the simulator plays the car 'f1tenth', the controller drives 'orca'",
+    ),
+    "another track": (
+        lambda c: br.drive(c, br.Simulator(c.car, "paddock")),
+        "the simulator is on the track 'paddock', the controller on 'harbour'",
+    ),
+    "engine": (lambda c: br.Simulator(c.car, c.track, engine="fmu"), "engine = 'fmu': give one of"),  # type: ignore[arg-type]
+    "delay": (lambda c: br.Simulator(c.car, c.track, delay_s=-5.0), "delay_s = -5.0: give seconds"),
+    "told delay": (
+        lambda c: c.step(at(c.track), delay_s=float("nan")),
+        "delay_s = nan: give seconds, at most 1",
+    ),
+    "applied input": (
+        lambda c: c.step(at(c.track), u_applied=(np.nan, 0.0)),
+        r"u_applied = \(nan, 0.0\): give finite numbers",
+    ),
+    "no numbers": (lambda c: c.step("fast"), "state = 'fast': give numbers"),
+    "exchanged arguments": (
+        lambda c: br.Controller(c.track, c.car),  # type: ignore[arg-type]
+        "car = Track: give a bayesrace.Car",
+    ),
+    "no track": (
+        lambda c: br.Controller(c.car, c.line),  # type: ignore[arg-type]
+        "track = RaceLine: give a bayesrace.Track",
+    ),
+    "too narrow": (
+        lambda c: br.Controller(c.car.changed(width_m=0.5), c.track),
+        "track 'harbour' is 0.37 m wide, the car 0.5 m",
+    ),
+    "horizon": (
+        lambda c: br.Controller(c.car, c.track, c.line, horizon=0.4),  # type: ignore[arg-type]
+        "horizon = 0.4: has to be a whole number",
+    ),
+    "changed": (
+        lambda c: c.car.changed(mass=0.05),
+        "unknown setting 'mass': did you mean 'mass_kg'",
+    ),
+    "points": (lambda c: br.train(drive(), c.car, points=0), "capacity = 0: has to be"),
+    "speeds": (
+        lambda c: br.train(drive([1, 1, 1, 3.6, 3.6, 1, 1]), c.car),
+        r"by x\[:, 3:5\] and dt .* m: give metres, metres per second",
+    ),
+    "angles": (lambda c: br.residuals(drive([1, 1, 57, 1, 1, 1, 1]), c.car), "turns faster than"),
+    "exchanged": (lambda c: br.residuals(drive(inputs=(1, 0)), c.car), r"drive.u\[:, 0\] is up to"),
+    "several cars": (
+        lambda c: br.train(br.drive(c, br.Simulator(c.car, c.track), 0, max_time_s=1.0), "f1tenth"),
+        r"drives of several cars \(orca-.*, f1tenth-.*\): train on those of one",
+    ),
+    "period": (
+        lambda c: br.train(
+            br.drive(c, br.Simulator(c.car, c.track, step_s=0.01), 0, max_time_s=1.0)
+        ),
+        "the run's states are 0.01 s apart, the controller's stages 0.02 s: give a Drive",
+    ),
+    "problem of no car": (
+        lambda c: br.Controller(c.car, c.track, c.line, problem=rail()),
+        "problem 'rail' drives no car along a line: step it by bayesrace.Mpc",
+    ),
+    "stage": (lambda _: br.Mpc(rail(), 10, 0.2, RAIL), "step_s = 0.2: problem.f gives"),
+    "missing parameter": (
+        lambda _: br.Mpc(rail(), 10, 0.1, {}),
+        "parameters: r of 'rail' are missing",
+    ),
+    "parameter": (
+        lambda _: br.Mpc(rail(), 10, 0.1, {"r": -1.0}),
+        "r = -1, which has to be above 0",
+    ),
+    "solver": (
+        lambda _: br.Mpc(rail(), 10, 0.1, RAIL, solver={"tol": 1e-3}),
+        "solver: no tol; there are tolerance, defect_max",
+    ),
+    "stages": (
+        lambda _: br.Mpc(rail(), 10, 0.1, RAIL).step([0.0, 0.0], [1.0, 2.0]),
+        r"stages: an array of shape \(2,\), expected \(10, 1\)",
     ),
     "nothing to learn from": (lambda _: br.train([]), r"drives = \[\]: give at least one run"),
     "no car": (

@@ -2,8 +2,8 @@
 
 :mod:`.values` has states and inputs, :mod:`.controller` the controller that is stepped by hand,
 :mod:`.simulator` the car, :mod:`.runs` the closed loop of both, :mod:`.training` what is learned
-from it; :mod:`.mpc` steps a control problem of one's own, :mod:`.logs` opens a recording,
-:mod:`.gym` is the environment for learned policies and :mod:`.testing` the plugin for pytest.
+from it; :mod:`.mpc` steps a control problem of one's own, :mod:`.logs` opens a recording, and
+:mod:`.systems` drives a plant and a controller process for :mod:`bayesrace.testing`.
 
 All of it is a thin layer: controllers, cars and closed loop are those of the command line.
 """

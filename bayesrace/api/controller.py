@@ -1,5 +1,6 @@
 """The controller as an object with ``step``, for control loops of one's own."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import IntEnum
@@ -11,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import ValidationError
 
-from bayesrace.api.values import Input, Range, State
+from bayesrace.api.values import Input, Range, State, car_of, number, track_of
 from bayesrace.arrays import Floats
 from bayesrace.controller.assembly import PredictiveController, compiled_controller
 from bayesrace.controller.driver import Driver, Level
@@ -20,6 +21,7 @@ from bayesrace.controller.settings import CycleSettings, GateSettings, MpcSettin
 from bayesrace.controller.weights.checks import Checks, Samples
 from bayesrace.errors import InputError, faults_in
 from bayesrace.gp.weights import Weights, encode_weights, read_weights
+from bayesrace.integrators import PERFECT
 from bayesrace.messages import SENSOR_FAULTS
 from bayesrace.messages import State as Measured
 from bayesrace.raceline import RaceLine, check_line, racing_line
@@ -33,34 +35,44 @@ __all__ = ["Controller", "Status", "Step", "Times", "validated"]
 
 
 class Status(IntEnum):
-    """What became of a step's optimisation problem, or why there was none."""
+    """What became of a step's optimisation problem, or why there was none; 0 and 1 are driven. The
+    numbers are this project's, not those of other solvers."""
 
     CONVERGED = 0
-    """Solved to the tolerance, or acceptable: driven."""
+    """Solved to the tolerance; of a :class:`Step` also what is acceptable."""
     ACCEPTABLE = 1
+    """Not to the tolerance, but the plan follows the model and keeps the bounds."""
     DEFECT = 2
     """The plan does not follow the model."""
     INFEASIBLE = 3
+    """A quadratic programme has no solution: hard bounds contradict each other."""
     QP_LIMIT = 4
+    """A quadratic programme took too many iterations."""
     NOT_FINITE = 5
+    """A number is not finite, as of a cost that is not convex in the states."""
     BAD_STATE = 6
+    """The state, or the input before, is absurd."""
     TIME_LIMIT = 7
+    """The time was up before there was a usable plan."""
     DOUBTED = 251
-    """The state contradicts those before it."""
+    """States contradict each other, for longer than they may be old."""
     UNPREDICTABLE = 252
-    """The state is too old to be predicted to the moment of acting."""
+    """The state could not be predicted to the moment of acting."""
     HALTED = 253
+    """The car is not to be driven."""
     NO_STATE = 254
+    """The newest one is too old."""
     STEP_FAILED = 255
+    """The step itself is broken."""
 
 
 @dataclass(slots=True)
 class Times:
-    """Where the time of a step went [us]."""
+    """How long the parts of a step took [us]."""
 
-    solve: float
+    solve_us: float
     """Execution time of the compiled step, from state to input."""
-    prepare: float
+    prepare_us: float
     """Preparation of the next step, after the input was known; 0 if it is yet to be made."""
 
 
@@ -82,7 +94,9 @@ class Step:
     level: Level
     """Who gave the input: the solution, the plan before, the fallback's braking, or stop."""
     fault: str
-    """What speaks against the state that was given; empty: nothing."""
+    """What speaks against the state that was given (``"position"``, ``"steering"``, ``"frozen"``
+    and the like, docs/faults.md), also where ``dt`` is wrong or :meth:`Controller.reset` was
+    forgotten; empty: nothing."""
     times: Times
 
 
@@ -100,8 +114,8 @@ class Controller:
 
     def __init__(
         self,
-        car: Car,
-        track: Track,
+        car: Car | Path | str,
+        track: Track | Path | str,
         line: RaceLine | None = None,
         *,
         problem: "str | Problem" = "tracking",
@@ -128,33 +142,33 @@ class Controller:
         from bayesrace.codegen.build import build
         from bayesrace.codegen.settings import BuildSettings
 
-        self.car = car
+        self.car = car = car_of(car)
         """Whose limits hold."""
-        self.track = track
+        self.track = track = track_of(track, car)
         """Where it is driven."""
         self.line = line if line is not None else racing_line(track, car)
         """What is followed."""
         _check_direction(self.line, track)
         check_line(self.line, track, car, "the racing line")
-        named = {"problem": problem} if isinstance(problem, str) else {}
+        wanted: dict[str, Any] = {"car": car, "model": model, "horizon": horizon}
         own = None if isinstance(problem, str) else problem
-        if model == "dynamic":
-            wanted = BuildSettings.best_case(car, horizon)
-            wanted = validated(BuildSettings, wanted.model_dump() | named)
-        else:
-            wanted = validated(
-                BuildSettings, {"car": car, "model": model, "horizon": horizon} | named
+        if own is None:
+            wanted["problem"] = problem
+        elif not own.path:
+            raise InputError(
+                f"problem '{own.name}' drives no car along a line: step it by bayesrace.Mpc"
             )
+        if model == "dynamic":
+            wanted |= {"discretisation": PERFECT, "gp_capacity": 8}
         tuned = validated(MpcSettings, dict(settings or {}))
-        self.artefact, _ = build(wanted, problem=own)
+        self.artefact, _ = build(validated(BuildSettings, wanted), problem=own)
         """Folder of the compiled controller, as ``bayesrace build`` names it."""
-        self.predictive: PredictiveController = compiled_controller(
+        self._predictive: PredictiveController = compiled_controller(
             self.artefact, car, track, self.line, None, tuned, parameters=parameters
         )
-        """What a process and :func:`bayesrace.drive` drive by."""
         compensation = {} if delay_s is None else {"mode": "fixed", "delay_s": delay_s}
-        self.cycle_settings = validated(CycleSettings, {"compensation": compensation})
-        self._driver = Driver(self.predictive, car, self.cycle_settings)
+        self._cycle_settings = validated(CycleSettings, {"compensation": compensation})
+        self._driver = Driver(self._predictive, car, self._cycle_settings)
         self._range = Range(car, track)
         self._run = self._seq = 0
         self._weights: Weights | None = None
@@ -165,7 +179,7 @@ class Controller:
     @property
     def native(self) -> NativeStep:
         """The compiled step, for measurements: its info, reference, evaluation."""
-        return self.predictive.native
+        return self._predictive.native
 
     @property
     def step_s(self) -> float:
@@ -203,6 +217,10 @@ class Controller:
         next step on; InputError for a name that the problem has not, or an impossible value."""
         self.native.set_values(values)
 
+    def __repr__(self) -> str:
+        name, problem = self.track.name, self.native.manifest.problem.name
+        return f"<Controller of '{self.car.name}' on '{name}': {problem}, {self._weights!r}>"
+
     def reset(self) -> None:
         """The next state is the first of a run: nothing is known of the car's past."""
         self._driver.lost(silent=False)
@@ -232,7 +250,9 @@ class Controller:
         InputError for a state or time that cannot be; nothing has happened then.
         """
         x = None if state is None else self._range.checked(state)
-        applied = self._u if u_applied is None else tuple(Input.of(u_applied))
+        applied = self._u if u_applied is None else _finite(u_applied)
+        if delay_s is not None:
+            number(delay_s, "delay_s", 0.0, 1.0, "seconds, at most 1")
         time_s = self._clock(self.step_s if dt is None else dt)
         driver = self._driver
         if x is not None:
@@ -272,12 +292,20 @@ class Controller:
         """Plant time of the state, without the rounding of a sum; InputError for no time."""
         if self._first:
             return 0.0
-        if not 0.0 < dt <= 10.0:
-            raise InputError(f"dt = {dt!r}: give seconds since the state before, above 0")
+        if not (isinstance(dt, int | float) and 0.0 < dt <= 10.0):
+            raise InputError(f"dt = {dt!r:.60}: give seconds since the state before, above 0")
         if dt != self._dt:
             self._begin_s, self._steps, self._dt = self._begin_s + self._steps * self._dt, 0, dt
         self._steps += 1
         return self._begin_s + self._steps * dt
+
+
+def _finite(u: Input | ArrayLike) -> tuple[float, ...]:
+    """The two numbers of an input."""
+    d, delta_rate = Input.of(u)
+    if not (math.isfinite(d) and math.isfinite(delta_rate)):
+        raise InputError(f"u_applied = {d, delta_rate}: give finite numbers")
+    return d, delta_rate
 
 
 def validated(form: Any, values: dict[str, Any]) -> Any:

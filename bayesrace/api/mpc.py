@@ -3,12 +3,14 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from time import perf_counter_ns
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from bayesrace.api.controller import Status, validated
+from bayesrace.api.values import numbers
 from bayesrace.arrays import Floats
 from bayesrace.codegen.problems.problem import Problem
 from bayesrace.controller.native_step import NativeProblem
@@ -68,41 +70,57 @@ class Mpc:
         parameters: Mapping[str, float],
         *,
         solver: Mapping[str, float] | None = None,
-        points: int = 1024,
+        gp_capacity: int = 1024,
     ) -> None:
         """Generates and compiles C the first time, and takes it from the cache then.
 
         ``horizon``: stages, 2 to 100. ``step_s``: length of a stage, that of ``problem.f``.
-        ``parameters``: run-time parameters by name; those left out are 0. ``solver``: tolerance,
-        defect_max, early_stop_tol, iterations, iterations_cold (:class:`.MpcSettings`).
-        ``points``: of the correction, at most. InputError names what cannot be used.
+        ``parameters``: run-time parameters by name. ``solver``: tolerance, defect_max,
+        early_stop_tol, iterations, iterations_cold, as of a controller's settings.
+        ``gp_capacity``: training points of an output of the correction, at most.
+
+        InputError names what cannot be used, or what ``problem.f`` and ``problem.advance`` say
+        differently of a stage.
         """
         from bayesrace.codegen.build import build
         from bayesrace.codegen.settings import BuildSettings
 
-        settings = validated(
-            BuildSettings,
-            {"discretisation": Discretisation(step_s=step_s), "horizon": horizon,
-             "gp_capacity": points},
-        )  # fmt: skip
-        self.problem, self.step_s = problem, step_s
+        if not isinstance(problem, Problem):
+            raise InputError(f"problem = {type(problem).__name__}: give a bayesrace.Problem")
+        stage = validated(Discretisation, {"step_s": step_s})
+        wanted = {"discretisation": stage, "horizon": horizon, "gp_capacity": gp_capacity}
+        settings = validated(BuildSettings, wanted)
+        _check_step(problem, step_s)
+        unknown = sorted(set(solver or {}) - set(_SOLVER))
+        if unknown:
+            raise InputError(f"solver: no {', '.join(unknown)}; there are {', '.join(_SOLVER)}")
+        self.problem = problem
+        """What is solved."""
+        self.step_s = step_s
+        """Length of a stage [s]."""
         folder, _ = build(settings, problem=problem)
         self.native = NativeProblem(folder)
         """The compiled problem, for measurements."""
+        names = {one.name for one in problem.parameters}
+        if missing := sorted(names - set(parameters)):
+            raise InputError(f"parameters: {', '.join(missing)} of '{problem.name}' are missing")
         self.native.set_values(_SOLVER | dict(parameters) | dict(solver or {}))
+        self._parameters = {name: float(value) for name, value in parameters.items()}
         self._shape = horizon, len(problem.stage_parameters)
+        self._u = np.zeros(len(problem.inputs))
 
     @property
-    def parameters(self) -> tuple[str, ...]:
-        """Names of the run-time parameters."""
-        return tuple(one.name for one in self.problem.parameters)
+    def parameters(self) -> Mapping[str, float]:
+        """Run-time parameters in use, by name."""
+        return MappingProxyType(self._parameters)
 
     def set_parameters(self, **values: float) -> None:
         """Changes run-time parameters from the next step on; InputError for an unknown name, or a
         value that the problem does not allow."""
         self.native.set_values(values)
+        self._parameters |= values
 
-    def correct(self, regressors: "Sequence[GaussianProcessRegressor]") -> None:
+    def set_regressors(self, regressors: "Sequence[GaussianProcessRegressor]") -> None:
         """Corrects the model by fitted regressors, one for each output of its residual, from the
         next step on; an empty sequence: no correction.
 
@@ -123,6 +141,7 @@ class Mpc:
     def reset(self) -> None:
         """Forgets the last plan: the next step starts cold."""
         self.native.reset()
+        self._u = np.zeros(len(self.problem.inputs))
 
     def step(
         self,
@@ -136,19 +155,16 @@ class Mpc:
         """One step from the measured state ``x`` (nx,).
 
         ``stages``: parameters of stages 1 to N, shape (N, np), or (np,) for the same at each.
-        ``u_before``: input (nu,) that acts now; zeros without. ``dt``: time since the step before
-        [s], a stage without. ``budget_s``: how long it may iterate; 0: as often as ``solver`` says.
+        ``u_before``: input (nu,) that acts now; that of the step before, without. ``dt``: time
+        since the step before [s], a stage without. ``budget_s``: how long it may iterate; 0: as
+        often as ``solver`` says.
         InputError for another shape or a number that is not finite.
         """
+        before = self._u if u_before is None else numbers(u_before, "u_before")
         given = {
-            "x": (np.asarray(x, dtype=np.float64), (len(self.problem.states),)),
-            "u_before": (
-                np.zeros(len(self.problem.inputs))
-                if u_before is None
-                else np.asarray(u_before, dtype=np.float64),
-                (len(self.problem.inputs),),
-            ),
-            "stages": (self._rows(stages), self._shape),
+            "x": (numbers(x, "x"), (len(self.problem.states),)),
+            "u_before": (before, (len(self.problem.inputs),)),
+            "stages": (self._rows(numbers(stages, "stages")), self._shape),
         }
         for name, (array, shape) in given.items():
             if array.shape != shape or not np.isfinite(array).all():
@@ -161,11 +177,25 @@ class Mpc:
         solve_us = (perf_counter_ns() - begin_ns) * 1e-3
         info: Any = self.native.info
         plan, plan_u = self.native.read_plan()
+        self._u = self.native.u.copy()
         return Solution(
-            self.native.u.copy(), plan.copy(), plan_u.copy(), Status(int(status)),
+            self._u.copy(), plan.copy(), plan_u.copy(), Status(int(status)),
             float(info.cost), int(info.iterations), solve_us,
         )  # fmt: skip
 
-    def _rows(self, stages: ArrayLike) -> Floats:
-        rows = np.asarray(stages, dtype=np.float64)
-        return np.broadcast_to(rows, self._shape).copy() if rows.ndim == 1 else rows
+    def _rows(self, rows: Floats) -> Floats:
+        """The same for each stage, if they are of one."""
+        same = rows.shape == self._shape[1:]
+        return np.broadcast_to(rows, self._shape).copy() if same else rows
+
+
+def _check_step(problem: Problem, step_s: float) -> None:
+    """InputError unless ``f`` is ``advance`` over a stage, at a place where neither is special."""
+    x, u, e = (np.linspace(0.1, 0.2, problem.f.size1_in(i)) for i in range(3))
+    over_stage = np.ravel(problem.advance(x, u, 0 * e, step_s))
+    step = np.ravel(problem.f(x, u, 0 * e))
+    if not np.allclose(step, over_stage, rtol=1e-6, atol=1e-9):
+        raise InputError(
+            f"step_s = {step_s:g}: problem.f gives {step}, problem.advance over so long "
+            f"{over_stage}; both have to be the same model"
+        )

@@ -9,19 +9,22 @@ from numpy.typing import ArrayLike, NDArray
 
 from bayesrace.api.controller import Controller
 from bayesrace.api.simulator import OwnSimulator, OwnVehicle, Simulator
-from bayesrace.api.values import State, optional
+from bayesrace.api.values import State, number, optional
 from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
 from bayesrace.log import LogWriter
+from bayesrace.messages import SENSOR_FAULTS
+from bayesrace.operation.analysis.laps import LapTimes
 from bayesrace.operation.closed_loop import ClosedLoop, Driven
-from bayesrace.raceline import RaceLine
+from bayesrace.raceline import RaceLine, same_track
 from bayesrace.sensors import EXACT
-from bayesrace.vehicles import car_text
+from bayesrace.tracks import Track
+from bayesrace.vehicles import Car, car_text
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["Run", "drive"]
+__all__ = ["Run", "drive", "ended"]
 
 _COLUMNS: Final = ("x", "y", "psi", "vx", "vy", "omega", "delta")
 
@@ -44,11 +47,14 @@ def drive(
 
     InputError for what cannot be driven; what a simulator of one's own raises passes through.
     """
-    if laps < 0 or (laps == 0 and max_time_s is None):
-        raise InputError(f"laps = {laps}: give a number from 1 on, or 0 and max_time_s")
+    if not isinstance(laps, int) or laps < 0 or (laps == 0 and max_time_s is None):
+        raise InputError(f"laps = {laps!r:.60}: give a whole number from 1 on, or 0 and max_time_s")
+    if max_time_s is not None:
+        number(max_time_s, "max_time_s", 0.0, 1e6, "seconds")
     car, track = controller.car, controller.track
     disturbed: dict[str, Any] = {"sensors": EXACT, "seed": 0, "delay_s": 0.0}
     if isinstance(simulator, Simulator):
+        _check_alike(controller, simulator)
         vehicle = simulator.vehicle
         disturbed = {name: getattr(simulator, name) for name in disturbed}
     else:
@@ -56,8 +62,8 @@ def drive(
     about = {"drive": {"car": car_text(car), "track": track.name}}
     writer = None if log is None else LogWriter(Path(log), about)
     loop = ClosedLoop(
-        car, track, controller.line, controller.predictive, vehicle, writer,
-        controller.cycle_settings, **disturbed,
+        car, track, controller.line, controller._predictive, vehicle, writer,
+        controller._cycle_settings, **disturbed,
     )  # fmt: skip
     try:
         driven = loop.drive(laps, max_time_s, x0=x0 if x0 is None else list(State.of(x0)))
@@ -68,12 +74,27 @@ def drive(
     return Run(driven, controller.line)
 
 
+def _check_alike(controller: Controller, simulator: Simulator) -> None:
+    """InputError for a car of another name, or another track; a car of the same name may have other
+    numbers than those that the controller knows."""
+    if simulator.car.name != controller.car.name:
+        raise InputError(
+            f"the simulator plays the car '{simulator.car.name}', the controller drives "
+            f"'{controller.car.name}': make both of one car, or of car.changed(...)"
+        )
+    if not same_track(simulator.track.identity, controller.track.identity):
+        raise InputError(
+            f"the simulator is on the track '{simulator.track.name}', the controller on "
+            f"'{controller.track.name}': make both on one"
+        )
+
+
 class Run:
     """What was driven: true states, inputs and decisions, one row a sampling period."""
 
     def __init__(self, driven: Driven, line: RaceLine) -> None:
         self.driven = driven
-        """The same as the command line has it."""
+        """The same run, as the command line judges it and learns from it."""
         self.line = line
         """What was followed."""
 
@@ -99,7 +120,8 @@ class Run:
 
     @property
     def off_track_m(self) -> Floats:
-        """How far the car's centre is outside the track at each counted state; negative inside."""
+        """How far the car's centre is outside the track [m], negative inside; at the states up to
+        the end of the last lap, or at all of a run without one."""
         return self.driven.off_track_m
 
     @property
@@ -118,9 +140,24 @@ class Run:
         return self.driven.levels
 
     @property
+    def car(self) -> Car:
+        """The car that the controller drove."""
+        return self.driven.car
+
+    @property
+    def track(self) -> Track:
+        """Where it was driven."""
+        return self.driven.track
+
+    @property
+    def fault(self) -> list[str]:
+        """What spoke against each state, empty where nothing did; see :attr:`.Step.fault`."""
+        return [SENSOR_FAULTS[one] for one in self.driven.faults]
+
+    @property
     def end(self) -> str:
         """Why the run ended, a sentence."""
-        return self.driven.end.text
+        return ended(self.driven.end.text, self.driven.laps)
 
     @property
     def weights_version(self) -> str:
@@ -166,3 +203,10 @@ class Run:
 
     def __repr__(self) -> str:
         return f"<Run of '{self.driven.car.name}' on '{self.driven.track.name}': {self.driven}>"
+
+
+def ended(text: str, laps: LapTimes) -> str:
+    """Why a run ended, and why fewer laps count than the car has crossed the line."""
+    if laps.cut_at is None:
+        return text
+    return f"{text}; it left out a piece of the track, and no lap counts from there on"

@@ -3,12 +3,12 @@
 from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Final, Protocol
+from typing import Final, Protocol, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from bayesrace.api.values import Input, Range, State
+from bayesrace.api.values import Input, Range, State, car_of, number, track_of
 from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
 from bayesrace.plant.settings import SimulatorName
@@ -26,7 +26,7 @@ _START_MPS: Final = 0.1
 class OwnSimulator(Protocol):
     """What :func:`bayesrace.drive` can drive besides :class:`Simulator`.
 
-    An attribute ``step_s`` states the time between two states [s]; 0.02 without.
+    An attribute ``step_s`` states the time between two states [s]; without, it is taken to be 0.02.
     """
 
     def reset(self, x0: Floats) -> "State | ArrayLike":
@@ -45,29 +45,39 @@ class Simulator:
 
     def __init__(
         self,
-        car: Car,
-        track: Track,
+        car: Car | Path | str,
+        track: Track | Path | str,
         *,
         step_s: float = 0.02,
+        engine: SimulatorName = "equations",
         fmu: Path | str | None = None,
-        simulator: SimulatorName = "equations",
         world: World | Path | str | None = None,
         sensors: Sensors | Path | str | None = None,
         seed: int = 0,
         delay_s: float = 0.0,
     ) -> None:
-        """``step_s``: sampling period. ``fmu``: plays the car in place of the equations; with it
-        the simulator wants to be closed (:meth:`close`, or ``with``). ``world``: what changes while
+        """``step_s``: sampling period. ``engine``: what plays the car, ``"equations"`` or
+        ``"slipx"`` (docs/f1tenth.md); or ``fmu``, with which the simulator wants to be closed
+        (:meth:`close`, or ``with``). ``world``: what changes while
         the car drives (docs/world.md). In :func:`bayesrace.drive` the controller is told what
         ``sensors`` report (a built-in set such as ``"odometry"``, or a TOML file), with errors by
-        ``seed``, and states and inputs each take ``delay_s`` [s].
+        ``seed``, and states and inputs each take ``delay_s`` [s], so that an input acts twice as
+        long after its state; in a loop of your own you know both.
 
         InputError for a car without tyres or inertia, which the equations need, and whatever else
         cannot be used.
         """
         from bayesrace.codegen.compiler import compiled
 
-        self.car, self.track, self.seed, self.delay_s = car, track, seed, delay_s
+        self.car = car = car_of(car)
+        """Whose equations and limits they are."""
+        self.track = track = track_of(track, car)
+        """Where it starts."""
+        self.seed, self.delay_s = seed, number(delay_s, "delay_s", 0, 1, "seconds, 0 to 1")
+        number(step_s, "step_s", 0.001, 0.1, "seconds, 0.001 to 0.1")
+        if engine not in get_args(SimulatorName):
+            known = ", ".join(get_args(SimulatorName))
+            raise InputError(f"engine = {engine!r:.60}: give one of {known}")
         if sensors is None:
             self.sensors = EXACT
         else:
@@ -78,7 +88,7 @@ class Simulator:
         self.vehicle: Vehicle = self._opened.enter_context(
             open_vehicle(
                 car, None if fmu is None else Path(fmu), None, 1 / step_s, compiled,
-                simulator=simulator, world=world or UNCHANGED,
+                simulator=engine, world=world or UNCHANGED,
             )
         )  # fmt: skip
         """What plays the car, as the plant process has it."""
@@ -120,6 +130,9 @@ class Simulator:
             raise InputError(f"u = {given}: give finite numbers, drive command and rad/s")
         self.vehicle.step(given)
         return self.state
+
+    def __repr__(self) -> str:
+        return f"<Simulator of '{self.car.name}' on '{self.track.name}' at {self.time_s:g} s>"
 
     def close(self) -> None:
         """Ends what was opened: an FMU's process."""

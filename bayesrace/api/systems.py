@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from bayesrace.api.controller import Controller, validated
-from bayesrace.api.testing import RECORDING, SystemRun
+from bayesrace.api.runs import ended
 from bayesrace.controller.settings import MpcSettings
 from bayesrace.errors import InputError
 from bayesrace.files import write_whole
@@ -19,6 +19,7 @@ from bayesrace.operation.system import private_network, started_system
 from bayesrace.raceline import RaceLine, write_raceline
 from bayesrace.recorder import Recorder
 from bayesrace.sensors import Sensors
+from bayesrace.testing import RECORDING, SystemRun
 from bayesrace.tracks import Track, write_track
 from bayesrace.vehicles import Car, car_text, write_car
 
@@ -70,9 +71,8 @@ def drive_system(
     if plant and (given := [name for name, value in simulated.items() if value]):
         name = "delay_ms" if given[0] == "delay_s" else given[0]
         raise InputError(f"{name}: the plant is a command of its own; give it there, or leave it")
-    driven_car = Car.load(car)
     driver = Controller(
-        driven_car, track if isinstance(track, Track) else Track.load(track, driven_car), line,
+        car, track, line,
         problem=problem, weights=weights, horizon=horizon, settings=settings,
     )  # fmt: skip
     asked = simulated | {"car": driver.car, "laps": laps, "mode": mode}
@@ -97,7 +97,7 @@ def drive_system(
             end = system.drive(driver.track, plan, recorder)
             statuses = {source: system.director.status(source) for source in SOURCES}
     driven = laps_in(folder / RECORDING, _RUN, driver.track)
-    return SystemRun(folder, driven, end.text, judge(*driven, laps), statuses)
+    return SystemRun(folder, driven, ended(end.text, driven.laps), judge(*driven, laps), statuses)
 
 
 def _written(

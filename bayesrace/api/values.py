@@ -4,6 +4,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import astuple, dataclass
 from importlib import import_module
 from operator import le
+from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
@@ -11,10 +12,41 @@ from numpy.typing import ArrayLike
 
 from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
-from bayesrace.tracks import Track
+from bayesrace.tracks import Track, wide_enough
 from bayesrace.vehicles import Car
 
-__all__ = ["Input", "Range", "State", "optional"]
+__all__ = ["Input", "Range", "State", "car_of", "number", "numbers", "optional", "track_of"]
+
+
+def numbers(values: ArrayLike, name: str) -> Floats:
+    """An array of them; InputError if they are none."""
+    try:
+        return np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise InputError(f"{name} = {values!r:.60}: give numbers") from None
+
+
+def number(value: float, name: str, low: float, high: float, remedy: str) -> float:
+    """The number; InputError unless it is one from ``low`` to ``high``."""
+    if isinstance(value, int | float | np.number) and low <= value <= high:
+        return float(value)
+    raise InputError(f"{name} = {value!r:.60}: give {remedy}")
+
+
+def car_of(car: "Car | Path | str") -> Car:
+    """A car, by its name, or from its file."""
+    if not isinstance(car, Car | Path | str):
+        raise InputError(f"car = {type(car).__name__}: give a bayesrace.Car, a name, or a file")
+    return Car.load(car)
+
+
+def track_of(track: "Track | Path | str", car: Car) -> Track:
+    """A track, by its name, or from its file; InputError if the car does not fit on it."""
+    if isinstance(track, Path | str):
+        return Track.load(track, car)
+    if not isinstance(track, Track):
+        raise InputError(f"track = {type(track).__name__}: give a bayesrace.Track, or a name")
+    return wide_enough(track, car.width_m)
 
 
 class _Numbers:
@@ -36,7 +68,7 @@ class _Numbers:
         if isinstance(values, cls):
             return values
         names = cls.__dataclass_fields__  # type: ignore[attr-defined]
-        given = np.asarray(values, dtype=np.float64)
+        given = numbers(values, cls.__name__.lower())
         if given.shape != (len(names),):
             raise InputError(
                 f"{cls.__name__.lower()}: an array of shape {given.shape}, expected "

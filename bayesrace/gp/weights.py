@@ -181,7 +181,7 @@ class GpOutput:
 _Outputs = tuple[InstanceOf[GpOutput], InstanceOf[GpOutput], InstanceOf[GpOutput]]
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class Weights:
     """The residual GP of one car for one discretised nominal model.
 
@@ -285,6 +285,10 @@ class Weights:
     def counts(self) -> tuple[int, ...]:
         """Number of training points per output; each must fit a controller's capacity."""
         return tuple(output.count for output in self.outputs)
+
+    def __repr__(self) -> str:
+        kinds = ", ".join(f"{o.count} {o.kernel}" for o in self.outputs)
+        return f"<Weights '{self.version}' of '{self.car}': {kinds} points>"
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Weights):

@@ -76,7 +76,7 @@ class LineIdentity:
     """Digest of the optimisation's settings."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class RaceLine:
     """Closed racing line, arrays (n,) in driving order; the last point is not the first again.
 
@@ -96,6 +96,9 @@ class RaceLine:
     length_m: float
     made_for: LineIdentity | None = None
     """None: not known; the line comes from elsewhere."""
+
+    def __repr__(self) -> str:
+        return f"<RaceLine on '{self.track_name}': {self.length_m:.3f} m, {self.lap_time_s:.3f} s>"
 
     @property
     def duration_s(self) -> Floats:

@@ -11,6 +11,7 @@ from bayesrace.tracks.library import (
     read_recentred,
     read_smoothed,
     read_track,
+    wide_enough,
     write_track,
 )
 from bayesrace.tracks.track import Crossing, PathProjection, StartLine, Track
@@ -30,5 +31,6 @@ __all__ = [
     "read_recentred",
     "read_smoothed",
     "read_track",
+    "wide_enough",
     "write_track",
 ]

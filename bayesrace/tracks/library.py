@@ -45,6 +45,7 @@ __all__ = [
     "read_recentred",
     "read_smoothed",
     "read_track",
+    "wide_enough",
     "write_track",
 ]
 
@@ -107,7 +108,7 @@ def load_track(name_or_path: str | Path, car_width_m: float | None = None) -> Tr
     """
     text = str(name_or_path)
     if text in builtin_tracks():
-        return _wide_enough(_builtin_track(text), car_width_m)
+        return wide_enough(_builtin_track(text), car_width_m)
     kind, colon, seed = text.partition(":")
     if colon and kind in RANDOM_TRACKS:
         if not is_random_track(text):
@@ -115,7 +116,7 @@ def load_track(name_or_path: str | Path, car_width_m: float | None = None) -> Tr
                 f"'{text[:40]}': the seed must be a whole number from 0 on, of at most 18 digits, "
                 "as in random:7"
             )
-        return _wide_enough(random_track(int(seed), kind), car_width_m)
+        return wide_enough(random_track(int(seed), kind), car_width_m)
     path = Path(name_or_path)
     if not path.is_file():
         raise InputError(
@@ -157,7 +158,7 @@ def load_any(
     return load_track(name, car_width_m), None, ""
 
 
-def _wide_enough(track: Track, car_width_m: float | None) -> Track:
+def wide_enough(track: Track, car_width_m: float | None) -> Track:
     """The same track; raises InputError if it is narrower than the car."""
     width = float((track.width_right_m + track.width_left_m).min())
     car = default_car_width_m(car_width_m)

@@ -44,7 +44,7 @@ class PathProjection:
     """Arc length without wrapping, first value in [-length/2, length/2): + length each lap."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Track:
     """Closed track given by nodes of its centreline; node 0 is the start line.
 
@@ -120,6 +120,9 @@ class Track:
         for array in arrays:
             array.setflags(write=False)
         return cls(name, *arrays, spline.period)
+
+    def __repr__(self) -> str:
+        return f"<Track '{self.name}': {self.length_m:.3f} m, {len(self.s_m)} nodes>"
 
     @cached_property
     def identity(self) -> str:

@@ -158,6 +158,14 @@ class Car(Part):
         """
         return get_car(source)
 
+    def changed(self, **values: Any) -> "Car":
+        """The same car with other numbers, such as ``mass_kg``; what follows from them is derived
+        anew. InputError names field, value and remedy."""
+        try:
+            return type(self).model_validate(self.model_dump(exclude_unset=True) | values)
+        except ValidationError as error:
+            raise InputError(f"car '{self.name}': {faults_in(error, 'the car', Car)}") from None
+
     @property
     def wheelbase_m(self) -> float:
         """Distance between the axles, lf + lr."""

@@ -175,17 +175,17 @@ def driving_problem(
     state_cost: StateCost,
     *,
     follows: tuple[Parameter, ...] = (),
-    weights: tuple[Parameter, ...] = (),
+    cost_weights: tuple[Parameter, ...] = (),
     proximal: tuple[float, float] = (0.0, 0.0),
 ) -> Problem:
     """The problem with one prediction model (seven states, drive command and steering rate).
 
     ``follows``: further parameters of a stage, which the planner takes from where the plan is on
-    the line; none: it gives points to track. ``weights``: further run-time parameters.
+    the line; none: it gives points to track. ``cost_weights``: further run-time parameters.
     ``proximal``: see :class:`Input`.
     """
     car = model.car
-    inputs, parameters = _inputs(car, proximal), (*_parameters(car), *weights)
+    inputs, parameters = _inputs(car, proximal), (*_parameters(car), *cost_weights)
     stage = (*REFERENCE, *follows)
     s = Symbols.of(len(STATES), len(inputs), len(stage), len(parameters))
     p = {one.name: s.p[i] for i, one in enumerate(stage)}

@@ -16,10 +16,18 @@ def functions(problem: Problem) -> list[ca.Function]:
     """Everything that the runtime calls, named ``br_...``."""
     return [
         *_derivatives(problem.linearise),
-        problem.advance,
+        _named("br_advance", problem.advance),
         _transition(problem.advance),
         *_parts(problem),
     ]
+
+
+def _named(name: str, function: ca.Function) -> ca.Function:
+    """The function under the name that the runtime calls; as it is, if it has that already."""
+    if function.name() == name:
+        return function
+    names = function.name_in(), function.name_out()
+    return ca.Function(name, function.sx_in(), function.call(function.sx_in(), True, False), *names)
 
 
 def _transition(advance: ca.Function) -> ca.Function:

@@ -17,6 +17,8 @@ from typing import Any, Final
 
 import casadi as ca
 
+from bayesrace.errors import InputError
+
 __all__ = [
     "NO_BOUND", "Input", "Parameter", "Problem", "Row", "State", "Symbols", "derivatives",
     "linearised", "with_arguments",
@@ -35,7 +37,8 @@ class State:
     scale: float = 1.0
     """Size of a defect that counts as 1 in its norm."""
     limit: float = 1e6
-    """A larger absolute value is no state of this system."""
+    """A larger absolute value is no state of this system, and refused; no bound of the problem,
+    which is a :class:`Row`."""
     deviation: float = 1.0
     """What feedback about a plan weighs as much as a deviation of another component, or an
     :attr:`Input.effort`."""
@@ -50,9 +53,10 @@ class Input:
     name: str
     unit: str
     held: bool = True
-    """Beyond the end of a plan that is shifted: held, or zero."""
+    """What a plan is continued with at its end when it is shifted by a stage: the last value, or
+    zero."""
     limit: float = 1e6
-    """A larger absolute value is no input of this system."""
+    """A larger absolute value is no input of this system, and refused; no bound of the problem."""
     effort: float = 1.0
     """What feedback about a plan weighs as much as a :attr:`State.deviation`."""
     odd: bool = False
@@ -106,7 +110,7 @@ class Symbols:
     p: ca.SX
     """Parameters of the stage."""
     theta: ca.SX
-    """Run-time parameters."""
+    """Run-time parameters, in the order of :attr:`Problem.parameters`."""
     last: ca.SX
     """1 at the last stage, else 0: a factor of the terminal cost."""
     share: ca.SX
@@ -125,7 +129,7 @@ class Symbols:
         )  # fmt: skip
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Problem:
     """One optimal control problem with its prediction model."""
 
@@ -134,34 +138,36 @@ class Problem:
     inputs: tuple[Input, ...]
     stage_parameters: tuple[Parameter, ...]
     parameters: tuple[Parameter, ...]
-    features: tuple[str, ...]
+    features: tuple[str, ...] = ()
     """Names of the states and inputs that the residual depends on."""
-    outputs: int
-    """Number of the residual's outputs."""
+    outputs: int = 0
+    """Number of the residual's outputs: of Gaussian processes that correct the model; 0: none."""
     symbols: Symbols
     f: ca.Function
     """The discretised model, (x, u, e) -> x_next; e is the residual's mean."""
-    linearise: ca.Function
-    """(x, u, e, lambda) -> f, its transposed Jacobian, Hessian of lambda' f; see `linearised`."""
+    linearise: Any = None
+    """(x, u, e, lambda) -> f, its transposed Jacobian, Hessian of lambda' f; :func:`linearised` of
+    ``f`` without."""
     advance: ca.Function
     """(x, u, e, h) -> x_next: the model over h [s]."""
     cost: ca.SX
     """l, convex and strictly so in u; of x, u, u_before, p, theta and last."""
     rows: tuple[Row, ...]
-    u_lower: ca.SX
+    u_lower: ca.SX | float
     """Of theta and the measured state, which stands in x."""
-    u_upper: ca.SX
+    u_upper: ca.SX | float
     guess: ca.SX
     """Input to begin with where there is no plan; of x, u_before, share, theta."""
-    acting: ca.SX
-    """What of u acts over h from x on, given the actuators' limits."""
-    reached: ca.SX
-    """The state that is then reached, given those limits; of x and theta."""
-    valid: ca.SX
+    acting: Any = None
+    """What of u acts over h from x on, given the actuators' limits; u without."""
+    reached: Any = None
+    """The state that is then reached, given those limits; of x and theta. x without."""
+    valid: Any = None
     """Above zero in all components for parameters that fit each other; of theta."""
     path: Mapping[str, str] = field(default_factory=dict)
-    """Roles (x, y, psi, vx, vy, omega, delta; duty, delta_rate) to names, for a planner that
-    follows a path; empty: there is none, and the stage parameters are always the caller's."""
+    """For a car that follows a line: which state or input is x, y, psi, vx, vy, omega, delta, duty
+    and delta_rate to the planner. Empty: there is no planner, and the stage parameters are always
+    the caller's. (Constraints along a path are :attr:`rows`.)"""
 
     follows_plan: bool = False
     """Whether the planner takes the stage parameters from where the plan itself is on the path, and
@@ -171,10 +177,16 @@ class Problem:
     """Numbers that C is compiled with, as ``BR_NAME``: those of the planner for a path."""
 
     def __post_init__(self) -> None:
-        """Checks what the generated code relies on; ValueError names what is wrong."""
+        """Checks what the generated code relies on; InputError names what is wrong."""
         self._check_names()
         self._check_rows()
         s = self.symbols
+        usual: dict[str, Any] = {"acting": s.u, "reached": s.x, "valid": ca.SX(1)}
+        if self.linearise is None:
+            usual["linearise"] = linearised(self.f)
+        for name, value in usual.items():
+            if getattr(self, name) is None:
+                object.__setattr__(self, name, value)
         everything = (s.x, s.u, s.u_before, s.p, s.theta, s.last, s.share, s.h)
         allowed: tuple[tuple[str, Any, tuple[Any, ...]], ...] = (
             ("the cost", self.cost, (s.x, s.u, s.u_before, s.p, s.theta, s.last)),
@@ -188,15 +200,15 @@ class Problem:
         for what, expression, known in allowed:
             others = [one for one in everything if not any(one is k for k in known)]
             if ca.depends_on(ca.SX(expression), ca.veccat(*others)):
-                raise ValueError(f"problem '{self.name}': {what} depends on what it must not")
+                raise InputError(f"problem '{self.name}': {what} depends on what it must not")
         hessian, _ = ca.hessian(self.cost, ca.veccat(s.x, s.u, s.u_before))
         n = s.x.numel()
         if hessian[:n, n:].nnz():
-            raise ValueError(f"problem '{self.name}': the cost couples states with inputs")
+            raise InputError(f"problem '{self.name}': the cost couples states with inputs")
 
     def _check_names(self) -> None:
         if not self.stage_parameters:
-            raise ValueError(f"problem '{self.name}': a stage needs at least one parameter")
+            raise InputError(f"problem '{self.name}': a stage needs at least one parameter")
         known = [*(one.name for one in self.states), *(one.name for one in self.inputs)]
         groups = {
             "state or input": known,
@@ -206,21 +218,21 @@ class Problem:
         for what, names in groups.items():
             for name in (self.name, *names):
                 if not name.isidentifier() or names.count(name) > 1:
-                    raise ValueError(f"'{name}' names no {what}, or more than one")
+                    raise InputError(f"'{name}' names no {what}, or more than one")
         if unknown := set(self.features) - set(known):
-            raise ValueError(f"problem '{self.name}' has no state or input {sorted(unknown)}")
+            raise InputError(f"problem '{self.name}' has no state or input {sorted(unknown)}")
 
     def _check_rows(self) -> None:
         x = self.symbols.x
         constant = [ca.jacobian(row.value, x).is_constant() for row in self.rows]
         if constant != sorted(constant, reverse=True):
-            raise ValueError(f"problem '{self.name}': rows with constant gradients come first")
+            raise InputError(f"problem '{self.name}': rows with constant gradients come first")
         for row, linear in zip(self.rows, constant, strict=True):
             if row.cautious and not row.soft:
-                raise ValueError(f"row '{row.name}' is cautious: give it a penalty")
+                raise InputError(f"row '{row.name}' is cautious: give it a penalty")
             if not (row.soft or linear):
                 # The line search weighs defects and soft rows alone.
-                raise ValueError(f"row '{row.name}' is not linear: give it a penalty")
+                raise InputError(f"row '{row.name}' is not linear: give it a penalty")
 
     @property
     def feature_indices(self) -> tuple[int, ...]:

@@ -44,7 +44,7 @@ def progress(model: Model, discretisation: Discretisation) -> Problem:
         discretisation,
         _cost,
         follows=_FOLLOWS,
-        weights=_WEIGHTS,
+        cost_weights=_WEIGHTS,
         proximal=(tuning.proximal_duty, tuning.proximal_delta_rate),
     )
 

@@ -204,7 +204,7 @@ def main(folder: Path) -> dict[str, Any]:
     perfect = br.Mpc(problem("cart_pole_perfect", TRUE), HORIZON, STEP_S, PARAMETERS)
     motions = {"nominal": simulated(mpc)}
     regressors = learned(*samples(mpc.problem, simulated(mpc, EXCITED_N)))
-    mpc.correct(regressors)
+    mpc.set_regressors(regressors)
     motions |= {"corrected": simulated(mpc), "perfect model": simulated(perfect)}
     for name, motion in motions.items():
         print(f"{name:>13}: {motion}")

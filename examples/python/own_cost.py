@@ -41,7 +41,7 @@ def gentle(car: br.Car) -> br.Problem:
         br.ocp.e_kinematic(car),
         br.ocp.PREDICTION,
         cost,
-        weights=(br.ocp.Parameter("q_slide", "s2/m2", "weight of sliding", low=0),),
+        cost_weights=(br.ocp.Parameter("q_slide", "s2/m2", "weight of sliding", low=0),),
     )
 
 

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from bayesrace.tracks import Track
     from bayesrace.vehicles import Car
 
-__all__ = ["AnyRun", "SystemRun", "assert_lap"]
+__all__ = ["SystemRun", "assert_lap"]
 
 RECORDING: Final = "run.mcap"
 
@@ -190,15 +190,13 @@ def _loop(
     given = [name for name, value in options.items() if value]
     if simulator is not None and given:
         raise br.InputError(f"{given[0]}: the simulator is your own; give it there, or leave it")
-    driven_car = br.Car.load(car)
-    driven_on = track if isinstance(track, br.Track) else br.Track.load(track, driven_car)
-    driver = br.Controller(driven_car, driven_on, **controller)
+    driver = br.Controller(car, track, **controller)
     with ExitStack() as opened:
         if simulator is None:
             simulator = opened.enter_context(
                 br.Simulator(
                     driver.car, driver.track, fmu=fmu, world=world, delay_s=delay_ms * 1e-3,
-                    sensors=driven_car.sensors if sensors is None else sensors, seed=seed,
+                    sensors=driver.car.sensors if sensors is None else sensors, seed=seed,
                 )
             )  # fmt: skip
         return br.drive(driver, simulator, laps, max_time_s=max_time_s, log=log)

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from bayesrace.api.place import Centreline, LapTimer, curvature_table
 from bayesrace.api.simulator import Simulator
-from bayesrace.api.values import Input, State, optional
+from bayesrace.api.values import Input, State, car_of, optional, track_of
 from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
 from bayesrace.operation.analysis.laps import SHORT_CUT
@@ -119,8 +119,8 @@ class RaceEnv(gymnasium.Env[Observation, Action]):
 
         InputError names what cannot be used.
         """
-        self.car = Car.load(car)
-        self.track = track if isinstance(track, Track) else Track.load(track, self.car)
+        self.car = car_of(car)
+        self.track = track_of(track, self.car)
         if ahead_m is None:
             ahead_m = [one * self.car.wheelbase_m for one in _AHEAD]
         self.ahead_m: Floats = np.asarray(ahead_m, dtype=np.float64)
@@ -350,4 +350,4 @@ def _start_state(options: Mapping[str, Any] | None) -> State | None:
 
 
 if ENV_ID not in gymnasium.registry:
-    gymnasium.register(ENV_ID, entry_point="bayesrace.api.gym:RaceEnv")
+    gymnasium.register(ENV_ID, entry_point="bayesrace.gym:RaceEnv")
