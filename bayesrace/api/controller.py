@@ -108,8 +108,8 @@ class Controller:
     """The predictive controller of one car on one track, as a controller process has it: planner,
     delay compensation, monitor of the states, step, and fallback. For one thread.
 
-    Each step costs some 10 us beyond the compiled code. States count from the first step, or the
-    last :meth:`reset`, which a run begins with.
+    A step costs some 13 us beyond the compiled code. A run begins with the first step, and after
+    each :meth:`reset`.
     """
 
     def __init__(
@@ -126,16 +126,21 @@ class Controller:
         parameters: Mapping[str, float] | None = None,
         delay_s: float | None = None,
     ) -> None:
-        """Generates and compiles C the first time (some seconds), and takes it from the cache then.
+        """Generates and compiles C the first time, which takes some seconds, and takes it from the
+        cache from then on.
 
-        ``line``: that of :func:`bayesrace.racing_line` without. ``problem``: ``"tracking"`` (the
-        paper's: follow the line at its speed), ``"progress"`` (as fast as possible), or one of your
-        own, made of :mod:`bayesrace.codegen.problems.driving`; ``parameters`` gives numbers to what
-        it has beyond that. ``model``: what it predicts by, e_kinematic with a learned correction,
-        or the simulator's own, ``"dynamic"``: BestCase. ``horizon``: stages; the car's without.
-        ``settings``: of the optimisation by name (:class:`.MpcSettings`), such as
-        ``{"caution": 0}``. ``delay_s``: from a state to the moment at which its input acts, where
-        it is known and constant; without, what :meth:`step` is told counts.
+        - ``line``: what is followed; None: :func:`bayesrace.racing_line` of car and track.
+        - ``problem``: ``"tracking"`` (the paper's: follow the line at its speed), ``"progress"``
+          (as fast as possible), or one of your own, made by ``bayesrace.ocp.driving_problem``.
+        - ``model``: what it predicts by, ``"e_kinematic"``, which weights correct, or
+          ``"dynamic"``, the simulator's own: BestCase.
+        - ``weights``: the correction to begin with, or its file.
+        - ``horizon``: stages that it looks ahead, 2 to 100; None: as the car's file says.
+        - ``settings``: of the optimisation by name, such as ``{"caution": 0}``; those of
+          ``bayesrace controller --settings`` (``controller/settings.py``).
+        - ``parameters``: values of what a problem of your own has beyond the settings.
+        - ``delay_s``: from a state to the moment at which its input acts, where that is known and
+          constant; None: as :meth:`step` is told.
 
         InputError names what does not fit together.
         """
@@ -240,14 +245,16 @@ class Controller:
     ) -> Step:
         """One control step from a measured state.
 
-        ``state``: (x, y, psi, vx, vy, omega, delta) in SI units; None if nothing was measured: the
-        last one is predicted forward for a while, then the fallback brakes. ``dt``: time since the
-        state before [s], :attr:`step_s` without; of no meaning for the first. ``u_applied``: input
-        that acted meanwhile, on average; what the step before returned, without. ``delay_s``: how
-        long after its state the newest input began to act: later states are predicted by as much.
-        ``prepare`` False: call :meth:`prepare` yourself once the input is on its way.
+        - ``state``: in the order of :class:`.State`, SI units; None: nothing was measured. The
+          last one is then predicted forward for a while, until the fallback brakes.
+        - ``dt``: time since the state before [s]; None: :attr:`step_s`. The first state has none.
+        - ``u_applied``: the input that acted meanwhile, on average; None: what the step before
+          returned.
+        - ``delay_s``: how long after its state the newest input began to act; later states are
+          predicted by as much.
+        - ``prepare``: False leaves it to you to call :meth:`prepare` once the input is on its way.
 
-        InputError for a state or time that cannot be; nothing has happened then.
+        InputError for a state, an input or a time that cannot be; nothing has happened then.
         """
         x = None if state is None else self._range.checked(state)
         applied = self._u if u_applied is None else _finite(u_applied)

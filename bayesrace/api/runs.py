@@ -38,14 +38,17 @@ def drive(
     max_time_s: float | None = None,
     log: Path | str | None = None,
 ) -> "Run":
-    """Drives until the laps are done (0: no limit), or the time is up.
+    """Drives until the laps are done, or the time is up.
 
     Everything happens in simulated time in this process: the run is equal, to the bit, to one of a
-    controller and a plant process in lockstep. ``x0``: start state (7,); the start line at walking
-    pace without. ``max_time_s``: three times the racing line's time for so many laps, and 2 s,
-    without. ``log``: file for a recording (MCAP), which :class:`bayesrace.Log` opens.
+    controller and a plant process in lockstep.
 
-    InputError for what cannot be driven; what a simulator of one's own raises passes through.
+    - ``laps``: crossings of the start line; 0: no limit but ``max_time_s``.
+    - ``x0``: start state; None: the start line at walking pace.
+    - ``max_time_s``: None: three times the racing line's time for so many laps, and 2 s.
+    - ``log``: file for a recording (MCAP), which :class:`bayesrace.Log` opens.
+
+    InputError for what cannot be driven; what a simulator of your own raises passes through.
     """
     if not isinstance(laps, int) or laps < 0 or (laps == 0 and max_time_s is None):
         raise InputError(f"laps = {laps!r:.60}: give a whole number from 1 on, or 0 and max_time_s")

@@ -56,13 +56,16 @@ class Simulator:
         seed: int = 0,
         delay_s: float = 0.0,
     ) -> None:
-        """``step_s``: sampling period. ``engine``: what plays the car, ``"equations"`` or
-        ``"slipx"`` (docs/f1tenth.md); or ``fmu``, with which the simulator wants to be closed
-        (:meth:`close`, or ``with``). ``world``: what changes while
-        the car drives (docs/world.md). In :func:`bayesrace.drive` the controller is told what
-        ``sensors`` report (a built-in set such as ``"odometry"``, or a TOML file), with errors by
-        ``seed``, and states and inputs each take ``delay_s`` [s], so that an input acts twice as
-        long after its state; in a loop of your own you know both.
+        """Without options: the built-in equations, sampled each 20 ms.
+
+        - ``step_s``: sampling period, 0.001 to 0.1 s.
+        - ``engine``: what plays the car, ``"equations"`` or ``"slipx"`` (docs/f1tenth.md).
+        - ``fmu``: an FMU plays it; the simulator then wants to be closed (:meth:`close`, ``with``).
+        - ``world``: what changes while the car drives (docs/world.md).
+        - ``sensors``: what the controller is told in :func:`bayesrace.drive`: a built-in set such
+          as ``"odometry"``, or a TOML file (docs/sensors.md); ``seed``: of their errors.
+        - ``delay_s``: what states, and inputs, take each in :func:`bayesrace.drive`, so that an
+          input acts twice as long after its state.
 
         InputError for a car without tyres or inertia, which the equations need, and whatever else
         cannot be used.

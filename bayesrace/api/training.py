@@ -64,13 +64,16 @@ def train(
 ) -> Weights:
     """Gaussian processes of what the e-kinematic model errs by, one each for vx, vy and omega.
 
-    ``car``: needed for arrays; runs and recordings know theirs, and all are of one car.
-    ``points``: training points of each output at most; the most informative ones are kept.
-    ``initial``: earlier weights to go on from, for an update; where the car has changed since, old
-    samples are brought up to date. ``method``:
-    ``"bayesrace"`` (kernels chosen by held-out log density, calibrated variances), or
-    ``"scikit-learn"``: ``GaussianProcessRegressor`` with an RBF kernel for each output on evenly
-    chosen samples, for comparison. ``progress`` is called with the share done and a text.
+    - ``drives``: runs, recordings and arrays of one car, in the order in which they were driven.
+    - ``car``: needed for arrays; runs and recordings know theirs.
+    - ``points``: training points of each output at most; the most informative ones are kept.
+    - ``initial``: earlier weights to go on from, for an update; where the car has changed since,
+      old samples are brought up to date.
+    - ``method``: ``"bayesrace"`` (kernels chosen by held-out log density, calibrated variances), or
+      ``"scikit-learn"``, for comparison: ``GaussianProcessRegressor`` with an RBF kernel for each
+      output, on evenly chosen samples.
+    - ``seed``: of the optimiser's starts.
+    - ``progress``: is called with the share done and a text.
 
     InputError for drives of different cars, too few samples, or a period that no controller has.
     """
