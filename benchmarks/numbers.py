@@ -74,6 +74,10 @@ MEASUREMENTS: Final = {
         "bayesrace latency --rate 500 --json {out}/latency.json", "latency.json",
         (*_STEP, "controller", "plant"),
     ),
+    "interface": Measurement(
+        "python -m benchmarks.interface --json {out}/interface.json", "interface.json",
+        (*_STEP, "controller", "plant", "operation/closed_loop.py", "benchmarks/interface.py"),
+    ),
     "paper": Measurement(
         "bayesrace paper --tracks {tracks} --data {data} --out {out}", "numbers.json",
         (*_RACE, "studies/paper"),
