@@ -12,7 +12,8 @@
     print(run.laps, learned.laps)
     learned.plot().savefig("learned.png")
 
-What ``__all__`` names is public, and nothing else; it is imported when it is first used.
+What ``__all__`` names is public, and besides the modules ``gym`` and ``testing``, which need other
+packages; nothing else is. It is imported when it is first used.
 docs/index.md explains each line.
 """
 
@@ -64,7 +65,10 @@ _PLACES: Final = {
 }  # fmt: skip
 """The module of each public name; empty: it is a module itself."""
 
-__all__ = ["__version__", *_PLACES]
+_OPTIONAL: Final = ("gym", "testing")
+"""Modules that need packages of other extras."""
+
+__all__ = ["__version__", *(name for name in _PLACES if name not in _OPTIONAL)]
 
 
 def __getattr__(name: str) -> Any:
@@ -75,7 +79,8 @@ def __getattr__(name: str) -> Any:
         return _version()
     if name not in _PLACES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    if (place := _PLACES[name]).startswith("api"):
+    place = _PLACES[name]
+    if name == "ocp" or place.startswith(("api", "codegen")):
         _check_packages()
     if not place:
         return import_module(f"{__name__}.{name}")

@@ -159,6 +159,7 @@ class RaceEnv(gymnasium.Env[Observation, Action]):
         that the car cannot be in or that is off the track.
         """
         super().reset(seed=seed)
+        self._end = None  # whatever fails now, no episode goes on
         x0 = _start_state(options)
         if x0 is None and self.start == "random":
             x0 = self._random_start()

@@ -16,11 +16,12 @@ from bayesrace.codegen.problems.problem import (
     Symbols,
     linearised,
 )
-from bayesrace.integrators import PREDICTION, Discretisation
+from bayesrace.integrators import PERFECT, PREDICTION, Discretisation
 from bayesrace.vehicles.models import Model, dynamic, e_kinematic
 
 __all__ = [
     "NO_BOUND",
+    "PERFECT",
     "PREDICTION",
     "Discretisation",
     "Input",

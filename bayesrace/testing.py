@@ -42,8 +42,12 @@ class AnyRun(Protocol):
         """Lap times [s], the first from the start state."""
 
     @property
+    def asked(self) -> int:
+        """Laps that were to be driven; 0: no number."""
+
+    @property
     def off_track(self) -> int:
-        """States up to the end of the last lap, or of a run without one, that are off the track."""
+        """States of these laps, or of a run that did not drive them, that are off the track."""
 
     @property
     def off_track_m(self) -> "Floats":
@@ -71,6 +75,8 @@ class SystemRun:
     verdict: "Verdict"
     """Of ``bayesrace drive``: ``passed``, if the laps were driven on the track, by solutions of the
     control problem for half of the time or more; and ``text``, a sentence."""
+    asked: int
+    """Laps that were to be driven; 0: no number."""
     statuses: Mapping[str, "Status"]
     """Of ``plant`` and ``controller`` after the run: among others their counters by name."""
 
@@ -81,7 +87,8 @@ class SystemRun:
 
     @property
     def off_track(self) -> int:
-        """States up to the end of the last lap, or of a run without one, that are off the track."""
+        """States of the laps that were asked for, or of a run that did not drive them, that are off
+        the track."""
         return int((self.off_track_m > 0).sum())
 
     @property
@@ -109,15 +116,17 @@ class SystemRun:
 def assert_lap(
     run: AnyRun, at_most_s: float | None = None, *, off_track: int = 0, lap: int = -1
 ) -> None:
-    """AssertionError unless the lap was driven, in that time, and the run stayed on the track.
+    """AssertionError unless all laps were driven, this one in that time, and on the track.
 
-    ``at_most_s``: of the lap [s]; any time without. ``off_track``: samples of the whole run, one a
+    ``at_most_s``: of the lap [s]; any time without. ``off_track``: samples of the laps, one a
     period, that may be off the track. ``lap``: index into ``run.laps``; the last without, 0 is the
     one from the start. The message says laps, samples off and how far, fallbacks, and why the run
     ended.
     """
     __tracebackhide__ = True
     faults = []
+    if len(run.laps) < run.asked:
+        faults.append(f"{len(run.laps)} of {run.asked} laps were driven")
     if not -len(run.laps) <= lap < len(run.laps):
         faults.append(f"laps[{lap}] was not driven")
     elif at_most_s is not None and not run.laps[lap] <= at_most_s:

@@ -182,17 +182,21 @@ class NativeProblem:
                 f"problem '{self.manifest.problem.name}' has no parameter {', '.join(unknown)}; "
                 f"it has {', '.join(known)}"
             )
+        given = self._ffi.new("br_mpc_parameters *", self._parameters[0])
         for name, value in values.items():
-            setattr(self._parameters, name, value)
-        error = self._library.br_mpc_set_parameters(self.handle, self._parameters)
+            try:
+                setattr(given, name, value)
+            except TypeError:
+                raise InputError(f"parameter {name} = {value!r:.60}: give a number") from None
+        error = self._library.br_mpc_set_parameters(self.handle, given)
         if error:
-            self._check(error, f"parameters ({', '.join(self._doubtful()) or 'their limits'})")
+            self._check(error, f"parameters ({', '.join(self._doubtful(given)) or 'their limits'})")
+        self._parameters = given
 
-    def _doubtful(self) -> list[str]:
-        """Parameters of the problem whose values it does not allow, with those."""
-        given = [
-            (one, getattr(self._parameters, one.name)) for one in self.manifest.problem.parameters
-        ]
+    def _doubtful(self, parameters: Any) -> list[str]:
+        """Those of the problem whose values it does not allow, with these."""
+        known = self.manifest.problem.parameters
+        given = [(one, getattr(parameters, one.name)) for one in known]
         return [
             f"{one.name} = {value:g}, which has to be "
             + ("above 0" if one.positive else f"from {one.low:g} to {one.high:g}")
@@ -460,8 +464,12 @@ class NativeStep(NativeProblem):
         super().__init__(artefact)
         self.manifest.check_car(car, artefact)
         self._line_mps, self._spacing_m = np.zeros(0), 0.0
-        values = settings.parameters(car, self.manifest.problem.name)
-        self.set_values(values | dict(parameters or {}))
+        values = settings.parameters(car, self.manifest.problem.name) | dict(parameters or {})
+        names = [one.name for one in self.manifest.problem.parameters]
+        if missing := [name for name in names if name not in values]:
+            problem = self.manifest.problem.name
+            raise InputError(f"parameters: {', '.join(missing)} of '{problem}' are missing")
+        self.set_values(values)
 
     def set_parameters(self, car: Car, settings: MpcSettings) -> None:
         """Weights, limits and tolerances of the OCP; effective from the next step."""

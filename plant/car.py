@@ -111,7 +111,7 @@ class CarRun:
             request.line_right_m,
         )
         vehicle.reset(request.x0)
-        start = vehicle.x.tolist() if vehicle.real else request.x0
+        start = vehicle.x.tolist() if vehicle.real or vehicle.places_itself else request.x0
         self._line.restart(start[0], start[1])
 
     @property

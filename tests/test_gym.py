@@ -1,4 +1,4 @@
-"""The environment for learned policies: api/gym.py and docs/gym.md."""
+"""The environment for learned policies: bayesrace/gym.py and docs/gym.md."""
 
 import importlib
 import re

@@ -207,6 +207,7 @@ class Driven:
     """A run as far as an assertion sees it."""
 
     laps: tuple[float, ...] = (7.0, 6.5)
+    asked: int = 2
     off_track_m: Floats = field(default_factory=lambda: np.array([-0.1, 0.02, 0.034]))
     off_track: int = 2
     level: Rows = field(default_factory=lambda: np.array([0, 1, 2]))
@@ -237,5 +238,10 @@ def test_an_assertion_that_fails_says_what_happened(options: dict[str, float], w
 
 
 def test_a_run_without_a_lap_says_so() -> None:
-    with pytest.raises(AssertionError, match="laps: none"):
+    with pytest.raises(AssertionError, match=r"0 of 2 laps were driven; [^\n]*\n  laps: none"):
         br.testing.assert_lap(Driven(laps=()))
+
+
+def test_a_run_that_stopped_early_is_none_that_passed() -> None:
+    with pytest.raises(AssertionError, match="1 of 2 laps were driven"):
+        br.testing.assert_lap(Driven(laps=(6.5,)), 7.0, off_track=2)

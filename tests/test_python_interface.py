@@ -1,5 +1,6 @@
 """``import bayesrace``: car, track, controller, simulator, closed loop, training, recordings."""
 
+import dataclasses
 import json
 import subprocess
 import sys
@@ -255,7 +256,11 @@ def test_arrays_teach_what_a_run_does(first: br.Run, orca: br.Car) -> None:
 
 
 def test_an_update_goes_on_from_earlier_weights(first: br.Run, weights: br.Weights) -> None:
-    again = br.train(first, points=200, initial=weights)
+    starts: list[float] = []
+    again = br.train(first, points=200, initial=weights, progress=lambda one, _: starts.append(one))
+    anew: list[float] = []
+    br.train(first, points=200, progress=lambda one, _: anew.append(one))
+    assert again.version != weights.version  # its variances are not those of first weights
     assert again.kernels == weights.kernels
 
 
@@ -343,7 +348,7 @@ def test_weights_are_checked_as_published_ones_are(
         br.Controller(other, br.Track.load("random10:1", other), weights=weights)
     flipped = regressors(KERNELS["rbf"], first)
     for one in flipped:
-        one.alpha_ = -20 * one.alpha_
+        one.alpha_ = -one.alpha_  # as large as the right one, the other way
     with pytest.raises(br.InputError, match=r"absurd|worse"):
         controller.weights = br.Weights.from_sklearn(flipped, controller.car)
     assert controller.weights is None
@@ -498,7 +503,7 @@ REFUSED: dict[str, tuple[Callable[[br.Controller], object], str]] = {
         lambda c: c.car.changed(mass=0.05),
         "unknown setting 'mass': did you mean 'mass_kg'",
     ),
-    "points": (lambda c: br.train(drive(), c.car, points=0), "capacity = 0: has to be"),
+    "points": (lambda c: br.train(drive(), c.car, points=0), "points = 0: has to be"),
     "speeds": (
         lambda c: br.train(drive([1, 1, 1, 3.6, 3.6, 1, 1]), c.car),
         r"by x\[:, 3:5\] and dt .* m: give metres, metres per second",
@@ -577,3 +582,79 @@ def test_a_host_without_casadi_is_told_what_to_install() -> None:
     assert said.strip() == (
         "the Python interface needs casadi, which is not installed: pip install 'bayesrace[race]'"
     )
+
+
+def test_values_that_are_refused_change_nothing(controller: br.Controller) -> None:
+    state = br.Simulator(controller.car, controller.track).state
+    before = controller.step(state).u
+    with pytest.raises(br.InputError, match="margin_m = -1, which has to be from 0"):
+        controller.set_parameters(r_duty=5.0, margin_m=-1.0)
+    with pytest.raises(br.InputError, match="parameter margin_m = 'wide': give a number"):
+        controller.set_parameters(margin_m="wide")  # type: ignore[arg-type]
+    controller.set_parameters(margin_m=0.01)  # as it was
+    controller.reset()
+    assert controller.step(state).u == before
+
+
+def own(car: br.Car, stage: Any = br.ocp.PREDICTION, **changes: Any) -> br.Problem:
+    """Tracking, as a problem of one's own."""
+
+    def cost(x: Any, p: Any, theta: Any, last: Any) -> Any:
+        return theta["q_position"] * ((x[0] - p["x"]) ** 2 + (x[1] - p["y"]) ** 2)
+
+    return br.ocp.driving_problem("mine", br.ocp.e_kinematic(car), stage, cost, **changes)
+
+
+def test_a_driving_problem_of_another_car_or_stage_is_refused(controller: br.Controller) -> None:
+    car, track, line = controller.car, controller.track, controller.line
+    slow = br.ocp.Discretisation(step_s=0.04, pose="interpolated")
+    for problem in (own(br.Car.load("f1tenth")), own(car, slow)):
+        with pytest.raises(br.InputError, match="does not predict as the e_kinematic model"):
+            br.Controller(car, track, line, problem=problem)
+    weighed = own(car, cost_weights=(br.ocp.Parameter("q_slip", "1"),))
+    with pytest.raises(br.InputError, match="parameters: q_slip of 'mine' are missing"):
+        br.Controller(car, track, line, problem=weighed)
+
+
+def test_functions_of_other_sizes_and_names_that_are_taken_are_refused() -> None:
+    with pytest.raises(br.InputError, match=r"problem 'rail': f takes \[2, 1, 0\] numbers"):
+        dataclasses.replace(rail(), outputs=1, features=("speed",))
+    taken = (br.ocp.Parameter("tolerance", "1"),)
+    with pytest.raises(br.InputError, match="'tolerance' is a setting of the solver"):
+        dataclasses.replace(rail(), parameters=taken)
+
+
+def test_a_simulator_that_begins_elsewhere_is_timed_from_there(
+    controller: br.Controller, weights: br.Weights
+) -> None:
+    class Behind(Own):
+        def reset(self, x0: Floats) -> Any:
+            x, y, psi = controller.track.start_pose()
+            return self._car.reset([x - 0.3 * np.cos(psi), y - 0.3 * np.sin(psi), *x0[2:]])
+
+    controller.weights = weights
+    run = br.drive(controller, Behind(controller.car, controller.track), laps=1)
+    assert len(run.laps) == 1
+
+
+def test_a_start_in_other_units_is_refused_and_leaves_no_recording(
+    controller: br.Controller, tmp_path: Path
+) -> None:
+    simulator, log = br.Simulator(controller.car, controller.track), tmp_path / "run.mcap"
+    with pytest.raises(br.InputError, match=r"state.vx = 40 is outside"):
+        br.drive(controller, simulator, x0=at(controller.track, vx=40.0), log=log)
+    assert not log.exists()
+
+
+def test_a_run_that_did_not_drive_its_laps_is_judged_to_its_end(first: br.Run) -> None:
+    assert len(first.off_track_m) == len(first.x)
+    assert first.off_track == int((first.frame().off_track_m > 0).sum()) > 0
+
+
+def test_a_closed_simulator_is_not_used(orca: br.Car, harbour: br.Track) -> None:
+    with br.Simulator(orca, harbour) as simulator:
+        simulator.step((0.1, 0.0))
+    with pytest.raises(br.InputError, match="has been closed"):
+        simulator.reset()
+    with pytest.raises(br.InputError, match="has been closed"):
+        simulator.step((0.1, 0.0))

@@ -21,7 +21,7 @@ from bayesrace.controller.settings import CycleSettings, GateSettings, MpcSettin
 from bayesrace.controller.weights.checks import Checks, Samples
 from bayesrace.errors import InputError, faults_in
 from bayesrace.gp.weights import Weights, encode_weights, read_weights
-from bayesrace.integrators import PERFECT
+from bayesrace.integrators import PERFECT, PREDICTION
 from bayesrace.messages import SENSOR_FAULTS
 from bayesrace.messages import State as Measured
 from bayesrace.raceline import RaceLine, check_line, racing_line
@@ -94,9 +94,9 @@ class Step:
     level: Level
     """Who gave the input: the solution, the plan before, the fallback's braking, or stop."""
     fault: str
-    """What speaks against the state that was given (``"position"``, ``"steering"``, ``"frozen"``
-    and the like, docs/faults.md), also where ``dt`` is wrong or :meth:`Controller.reset` was
-    forgotten; empty: nothing."""
+    """Fault found in the state that was given (``"position"``, ``"steering"``, ``"frozen"`` and the
+    like, docs/faults.md), also where ``dt`` is wrong or :meth:`Controller.reset` was forgotten;
+    empty: none."""
     times: Times
 
 
@@ -151,20 +151,22 @@ class Controller:
         """Whose limits hold."""
         self.track = track = track_of(track, car)
         """Where it is driven."""
+        if line is not None and not isinstance(line, RaceLine):
+            raise InputError(
+                f"line = {type(line).__name__}: give what bayesrace.racing_line returns"
+            )
         self.line = line if line is not None else racing_line(track, car)
         """What is followed."""
         _check_direction(self.line, track)
         check_line(self.line, track, car, "the racing line")
         wanted: dict[str, Any] = {"car": car, "model": model, "horizon": horizon}
+        if model == "dynamic":
+            wanted |= {"discretisation": PERFECT, "gp_capacity": 8}
         own = None if isinstance(problem, str) else problem
         if own is None:
             wanted["problem"] = problem
-        elif not own.path:
-            raise InputError(
-                f"problem '{own.name}' drives no car along a line: step it by bayesrace.Mpc"
-            )
-        if model == "dynamic":
-            wanted |= {"discretisation": PERFECT, "gp_capacity": 8}
+        else:
+            _check_problem(own, car, model)
         tuned = validated(MpcSettings, dict(settings or {}))
         self.artefact, _ = build(validated(BuildSettings, wanted), problem=own)
         """Folder of the compiled controller, as ``bayesrace build`` names it."""
@@ -288,6 +290,11 @@ class Controller:
             Times(decision.step_us, self.prepare() if prepare else 0.0),
         )  # fmt: skip
 
+    def checked(self, state: State | ArrayLike) -> tuple[float, ...]:
+        """The seven numbers of a state; InputError for what none of this car on this track can
+        be."""
+        return self._range.checked(state)
+
     def prepare(self) -> float:
         """Prepares the next step, for a state that comes an interval after the last; how long it
         took [us]."""
@@ -297,14 +304,34 @@ class Controller:
 
     def _clock(self, dt: float) -> float:
         """Plant time of the state, without the rounding of a sum; InputError for no time."""
+        if not (isinstance(dt, int | float | np.number) and 0.0 < dt <= 10.0):
+            raise InputError(f"dt = {dt!r:.60}: give seconds since the state before, above 0")
         if self._first:
             return 0.0
-        if not (isinstance(dt, int | float) and 0.0 < dt <= 10.0):
-            raise InputError(f"dt = {dt!r:.60}: give seconds since the state before, above 0")
+        dt = float(dt)
         if dt != self._dt:
             self._begin_s, self._steps, self._dt = self._begin_s + self._steps * self._dt, 0, dt
         self._steps += 1
         return self._begin_s + self._steps * dt
+
+
+def _check_problem(problem: "Problem", car: Car, model: str) -> None:
+    """InputError unless it drives this car along a line, and predicts as weights are learned."""
+    from bayesrace.vehicles.models import MODELS
+
+    if not problem.path:
+        raise InputError(
+            f"problem '{problem.name}' drives no car along a line: step it by bayesrace.Mpc"
+        )
+    stage = PERFECT if model == "dynamic" else PREDICTION
+    x, u, e = np.array([0.0, 0, 0.1, 1.5, 0.1, 1, 0.1]), np.array([0.3, 0.2]), np.zeros(3)
+    expected = stage.corrected(MODELS[model](car))(x, u, e)
+    if not np.allclose(problem.f(x, u, e), expected, rtol=1e-9, atol=1e-12):
+        raise InputError(
+            f"problem '{problem.name}' does not predict as the {model} model of '{car.name}' does "
+            f"over {stage.step_s:g} s: make it of bayesrace.ocp.{model}(car) and "
+            f"{'PERFECT' if model == 'dynamic' else 'PREDICTION'}"
+        )
 
 
 def _finite(u: Input | ArrayLike) -> tuple[float, ...]:
@@ -315,12 +342,13 @@ def _finite(u: Input | ArrayLike) -> tuple[float, ...]:
     return d, delta_rate
 
 
-def validated(form: Any, values: dict[str, Any]) -> Any:
-    """Settings of this form; InputError names what is wrong with the values."""
+def validated(form: Any, values: dict[str, Any], names: Mapping[str, str] | None = None) -> Any:
+    """Settings of this form; InputError names what is wrong with the values. ``names``: of fields
+    that the caller knows by others."""
     try:
         return form.model_validate({k: v for k, v in values.items() if v is not None and v != {}})
     except ValidationError as error:
-        raise InputError(faults_in(error, "the settings", form)) from None
+        raise InputError(faults_in(error, "the settings", form, names=names)) from None
 
 
 def _check_direction(line: RaceLine, track: Track) -> None:

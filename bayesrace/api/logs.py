@@ -18,7 +18,8 @@ __all__ = ["Log"]
 
 
 class Log:
-    """A recording (MCAP) of a race, a drive or a real car; it may still be written.
+    """A recording (MCAP) of a race, a drive or a real car; of one that is still written, what it
+    has when it is opened and first read.
 
     ``log["state"]`` is a structured array with a row for each message: ``log["state"]["x"]`` has
     shape (n, 7). docs/architecture.md lists the topics, :mod:`bayesrace.messages` their fields.

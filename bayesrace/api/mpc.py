@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from bayesrace.api.controller import Status, validated
-from bayesrace.api.values import numbers
+from bayesrace.api.values import number, numbers
 from bayesrace.arrays import Floats
 from bayesrace.codegen.problems.problem import Problem
 from bayesrace.controller.native_step import NativeProblem
@@ -101,6 +101,8 @@ class Mpc:
         folder, _ = build(settings, problem=problem)
         self.native = NativeProblem(folder)
         """The compiled problem, for measurements."""
+        if not isinstance(parameters, Mapping):
+            raise InputError(f"parameters = {parameters!r:.60}: give values by name")
         names = {one.name for one in problem.parameters}
         if missing := sorted(names - set(parameters)):
             raise InputError(f"parameters: {', '.join(missing)} of '{problem.name}' are missing")
@@ -118,7 +120,8 @@ class Mpc:
         """Changes run-time parameters from the next step on; InputError for an unknown name, or a
         value that the problem does not allow."""
         self.native.set_values(values)
-        self._parameters |= values
+        known = {one.name for one in self.problem.parameters}
+        self._parameters |= {one: float(value) for one, value in values.items() if one in known}
 
     def set_regressors(self, regressors: "Sequence[GaussianProcessRegressor]") -> None:
         """Corrects the model by fitted regressors, one for each output of its residual, from the
@@ -160,6 +163,9 @@ class Mpc:
         often as ``solver`` says.
         InputError for another shape or a number that is not finite.
         """
+        number(budget_s, "budget_s", 0.0, 1e3, "seconds, 0 or more")
+        if dt is not None:
+            number(dt, "dt", 0.0, 1e3, "seconds since the step before")
         before = self._u if u_before is None else numbers(u_before, "u_before")
         given = {
             "x": (numbers(x, "x"), (len(self.problem.states),)),

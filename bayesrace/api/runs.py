@@ -1,5 +1,6 @@
 """The closed loop of controller and car, and what it leaves: laps, arrays, a table, a picture."""
 
+from contextlib import ExitStack, closing
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -50,7 +51,7 @@ def drive(
 
     InputError for what cannot be driven; what a simulator of your own raises passes through.
     """
-    if not isinstance(laps, int) or laps < 0 or (laps == 0 and max_time_s is None):
+    if not isinstance(laps, int | np.integer) or laps < 0 or (laps == 0 and max_time_s is None):
         raise InputError(f"laps = {laps!r:.60}: give a whole number from 1 on, or 0 and max_time_s")
     if max_time_s is not None:
         number(max_time_s, "max_time_s", 0.0, 1e6, "seconds")
@@ -62,19 +63,17 @@ def drive(
         disturbed = {name: getattr(simulator, name) for name in disturbed}
     else:
         vehicle = OwnVehicle(simulator, car, track)
+    start = None if x0 is None else list(controller.checked(x0))
     about = {"drive": {"car": car_text(car), "track": track.name}}
-    writer = None if log is None else LogWriter(Path(log), about)
-    loop = ClosedLoop(
-        car, track, controller.line, controller._predictive, vehicle, writer,
-        controller._cycle_settings, **disturbed,
-    )  # fmt: skip
-    try:
-        driven = loop.drive(laps, max_time_s, x0=x0 if x0 is None else list(State.of(x0)))
-    finally:
-        controller.reset()
-        if writer is not None:
-            writer.close()
-    return Run(driven, controller.line)
+    with ExitStack() as opened:
+        opened.callback(controller.reset)
+        writer = None if log is None else opened.enter_context(closing(LogWriter(Path(log), about)))
+        loop = ClosedLoop(
+            car, track, controller.line, controller._predictive, vehicle, writer,
+            controller._cycle_settings, **disturbed,
+        )  # fmt: skip
+        driven = loop.drive(int(laps), max_time_s, x0=start)
+    return Run(driven, controller.line, laps)
 
 
 def _check_alike(controller: Controller, simulator: Simulator) -> None:
@@ -95,11 +94,13 @@ def _check_alike(controller: Controller, simulator: Simulator) -> None:
 class Run:
     """What was driven: true states, inputs and decisions, one row a sampling period."""
 
-    def __init__(self, driven: Driven, line: RaceLine) -> None:
+    def __init__(self, driven: Driven, line: RaceLine, asked: int) -> None:
         self.driven = driven
         """The same run, as the command line judges it and learns from it."""
         self.line = line
         """What was followed."""
+        self.asked = asked
+        """Laps that were to be driven; 0: no number."""
 
     @property
     def t(self) -> Floats:
@@ -121,25 +122,28 @@ class Run:
         """Lap times [s], the first from the start state; interpolated at the line."""
         return self.driven.laps_s
 
-    @property
+    @cached_property
     def off_track_m(self) -> Floats:
         """How far the car's centre is outside the track [m], negative inside; at the states up to
-        the end of the last lap, or at all of a run without one."""
-        return self.driven.off_track_m
+        the end of the last lap that was asked for, or at all of a run that did not drive them."""
+        if 0 < self.asked <= len(self.laps):
+            return self.driven.off_track_m
+        return self.track.project_path(self.x[:, :2]).off_track_m
 
     @property
     def off_track(self) -> int:
-        """States up to the end of the last lap, or of a run without one, that are off the track."""
+        """How many of the states that :attr:`off_track_m` has are off the track."""
         return int((self.off_track_m > 0).sum())
 
     @property
     def status(self) -> NDArray[np.int64]:
-        """:class:`bayesrace.Status` of the steps, shape (n - 1,)."""
+        """:class:`bayesrace.Status` of the steps, one for each state that was answered: shape
+        (n - 1,), or (n,) where the simulator has failed."""
         return self.driven.statuses
 
     @property
     def level(self) -> NDArray[np.int64]:
-        """Who gave the inputs: :class:`bayesrace.Level`, shape (n - 1,)."""
+        """Who gave the inputs: :class:`bayesrace.Level`, shape as of :attr:`status`."""
         return self.driven.levels
 
     @property
@@ -154,7 +158,7 @@ class Run:
 
     @property
     def fault(self) -> list[str]:
-        """What spoke against each state, empty where nothing did; see :attr:`.Step.fault`."""
+        """Fault found in each state that was answered; empty: none. See :attr:`.Step.fault`."""
         return [SENSOR_FAULTS[one] for one in self.driven.faults]
 
     @property

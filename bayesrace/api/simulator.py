@@ -60,7 +60,7 @@ class Simulator:
 
         - ``step_s``: sampling period, 0.001 to 0.1 s.
         - ``engine``: what plays the car, ``"equations"`` or ``"slipx"`` (docs/f1tenth.md).
-        - ``fmu``: an FMU plays it; the simulator then wants to be closed (:meth:`close`, ``with``).
+        - ``fmu``: an FMU plays it; the simulator must then be closed (:meth:`close`, or ``with``).
         - ``world``: what changes while the car drives (docs/world.md).
         - ``sensors``: what the controller is told in :func:`bayesrace.drive`: a built-in set such
           as ``"odometry"``, or a TOML file (docs/sensors.md); ``seed``: of their errors.
@@ -87,7 +87,9 @@ class Simulator:
             self.sensors = sensors if isinstance(sensors, Sensors) else get_sensors(sensors)
         if world is not None and not isinstance(world, World):
             world = get_world(world)
-        self._opened = ExitStack()
+        if fmu is not None and engine != "equations":
+            raise InputError(f"fmu = {fmu}, engine = {engine!r}: only one can play the car")
+        self._opened, self._closed = ExitStack(), False
         self.vehicle: Vehicle = self._opened.enter_context(
             open_vehicle(
                 car, None if fmu is None else Path(fmu), None, 1 / step_s, compiled,
@@ -123,6 +125,7 @@ class Simulator:
         pace. InputError for a state that this car cannot be in."""
         if x0 is None:
             x0 = State(*self.track.start_pose(), _START_MPS, 0.0, 0.0, 0.0)
+        self._check_open()
         self.vehicle.reset(self._range.checked(x0))
         return self.state
 
@@ -131,15 +134,21 @@ class Simulator:
         d, delta_rate = given = tuple(Input.of(u))
         if not (np.isfinite(d) and np.isfinite(delta_rate)):
             raise InputError(f"u = {given}: give finite numbers, drive command and rad/s")
+        self._check_open()
         self.vehicle.step(given)
         return self.state
+
+    def _check_open(self) -> None:
+        if self._closed:
+            raise InputError("the simulator has been closed: make another one")
 
     def __repr__(self) -> str:
         return f"<Simulator of '{self.car.name}' on '{self.track.name}' at {self.time_s:g} s>"
 
     def close(self) -> None:
-        """Ends what was opened: an FMU's process."""
+        """Ends what was opened: an FMU's process. It cannot be used any more."""
         self._opened.close()
+        self._closed = True
 
     def __enter__(self) -> "Simulator":
         return self
@@ -151,6 +160,8 @@ class Simulator:
 class OwnVehicle(Vehicle):
     """A simulator of one's own as what a run drives; its limits are its own matter."""
 
+    places_itself = True
+
     def __init__(self, own: OwnSimulator, car: Car, track: Track) -> None:
         """InputError for an object without ``reset`` and ``step``."""
         missing = [name for name in ("reset", "step") if not callable(getattr(own, name, None))]
@@ -159,7 +170,8 @@ class OwnVehicle(Vehicle):
                 f"simulator = {type(own).__name__}: it has no {' and no '.join(missing)}; give a "
                 "bayesrace.Simulator, or an object with reset(x0) -> state and step(u) -> state"
             )
-        super().__init__(car, float(getattr(own, "step_s", 0.02)), 1)
+        step_s = number(getattr(own, "step_s", 0.02), "simulator.step_s", 1e-4, 10, "seconds")
+        super().__init__(car, step_s, 1)
         self._own, self._range = own, Range(car, track)
 
     def _place(self, start: Floats) -> None:

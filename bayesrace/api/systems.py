@@ -97,7 +97,11 @@ def drive_system(
             end = system.drive(driver.track, plan, recorder)
             statuses = {source: system.director.status(source) for source in SOURCES}
     driven = laps_in(folder / RECORDING, _RUN, driver.track)
-    return SystemRun(folder, driven, ended(end.text, driven.laps), judge(*driven, laps), statuses)
+    verdict = judge(*driven, laps)
+    if not 0 < laps <= len(driven.laps.times_s):  # all of the run counts
+        off_m = driver.track.project_path(driven.samples["x"][:, :2]).off_track_m
+        driven = driven._replace(off_track_m=off_m)
+    return SystemRun(folder, driven, ended(end.text, driven.laps), verdict, laps, statuses)
 
 
 def _written(

@@ -32,6 +32,7 @@ Method = Literal["bayesrace", "scikit-learn"]
 _SAME_S: Final = 1e-9
 _ALIKE: Final = 0.7
 """Of two lengths of one way, by places and by speeds: noise and sampling explain no more."""
+_NAMES: Final = {"capacity": "points"}
 _METHODS: Final = ("bayesrace", "scikit-learn")
 
 
@@ -72,26 +73,29 @@ def train(
     - ``method``: ``"bayesrace"`` (kernels chosen by held-out log density, calibrated variances), or
       ``"scikit-learn"``, for comparison: ``GaussianProcessRegressor`` with an RBF kernel for each
       output, on evenly chosen samples.
-    - ``seed``: of the optimiser's starts.
+    - ``seed``: of the optimiser's starts; scikit-learn has one start.
     - ``progress``: is called with the share done and a text.
 
     InputError for drives of different cars, too few samples, or a period that no controller has.
     """
     if method not in _METHODS:
         raise InputError(f"method = {method!r}: give one of {', '.join(_METHODS)}")
+    settings = validated(TrainingSettings, {"capacity": points, "seed": seed}, _NAMES)
+    if initial is not None and not isinstance(initial, Weights):
+        raise InputError(f"initial = {type(initial).__name__}: give bayesrace.Weights")
     samples = _samples(drives, car)
     if method == "scikit-learn":
+        if initial is not None:
+            raise InputError("initial: scikit-learn begins anew; leave it, or the method")
         from bayesrace.learning.scikit import train as train_by_scikit
 
-        return train_by_scikit(samples, PREDICTION, points, seed)
+        report = progress or (lambda share, text: None)
+        return train_by_scikit(samples, PREDICTION, points, report)
     from bayesrace.learning.change import brought_up_to_date
     from bayesrace.learning.training import train as train_bayesrace
 
-    if initial is not None and not isinstance(initial, Weights):
-        raise InputError(f"initial = {type(initial).__name__}: give bayesrace.Weights")
     if initial is not None:
         samples, _ = brought_up_to_date(samples, initial, PREDICTION)
-    settings = validated(TrainingSettings, {"capacity": points, "seed": seed})
     return train_bayesrace(samples, PREDICTION, settings, initial, progress)
 
 
@@ -109,8 +113,10 @@ def residuals(drives: Drives, car: "Car | Path | str | None" = None) -> tuple[Fl
 
 def _samples(drives: Drives, car: "Car | Path | str | None") -> Dataset:
     """What can be learned from them, all of one car."""
-    if isinstance(drives, Run | Drive | Log):
-        drives = [drives]
+    try:
+        drives = [drives] if isinstance(drives, Run | Drive | Log) else list(drives)
+    except TypeError:
+        drives = [drives]  # type: ignore[list-item]
     if not drives:
         raise InputError("drives = []: give at least one run, recording or drive")
     known = [one.car for one in drives if isinstance(one, Run)]

@@ -52,17 +52,26 @@ def weights_of(
         output_of(one, f"the regressor of {name}", len(FEATURES))
         for one, name in zip(regressors, OUTPUTS, strict=True)
     )
-    z = np.asarray(regressors[0].X_train_, dtype=np.float64)
-    z = z[np.unique(np.linspace(0, len(z) - 1, _CHECKED).astype(int))]
+    every = np.asarray(regressors[0].X_train_, dtype=np.float64)
+    rows = np.unique(np.linspace(0, len(every) - 1, _CHECKED).astype(int))
+    known = [_targets(one, every)[rows] for one in regressors]
     return Weights(
         version=version,
         car=car.name,
         discretisation=discretisation.identity("e_kinematic", car),
         program="scikit-learn",
-        sample_features=z,
-        sample_residuals=np.column_stack([one.predict(z) for one in regressors]),
+        sample_features=every[rows],
+        sample_residuals=np.column_stack(known),
         outputs=(vx, vy, omega),
     )
+
+
+def _targets(regressor: GaussianProcessRegressor, z: Floats) -> Floats:
+    """What it was fitted to, if that was at these features; else what it predicts there."""
+    if not np.array_equal(regressor.X_train_, z):
+        return np.asarray(regressor.predict(z))
+    scaled = np.ravel(regressor.y_train_)
+    return np.asarray(scaled * regressor._y_train_std + regressor._y_train_mean)
 
 
 def output_of(regressor: GaussianProcessRegressor, name: str, width: int) -> GpOutput:

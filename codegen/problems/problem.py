@@ -24,6 +24,11 @@ __all__ = [
     "linearised", "with_arguments",
 ]  # fmt: skip
 
+_TAKEN: Final = {
+    "tolerance", "defect_max", "early_stop_tol", "iterations", "iterations_cold", "caution_sigmas",
+}  # fmt: skip
+"""Names beside the problem's in br_mpc_parameters, controller/native/bayesrace_mpc.h."""
+
 NO_BOUND: Final = 1e20
 """A bound of a row that is none."""
 
@@ -179,6 +184,7 @@ class Problem:
     def __post_init__(self) -> None:
         """Checks what the generated code relies on; InputError names what is wrong."""
         self._check_names()
+        self._check_sizes()
         self._check_rows()
         s = self.symbols
         usual: dict[str, Any] = {"acting": s.u, "reached": s.x, "valid": ca.SX(1)}
@@ -219,8 +225,25 @@ class Problem:
             for name in (self.name, *names):
                 if not name.isidentifier() or names.count(name) > 1:
                     raise InputError(f"'{name}' names no {what}, or more than one")
+        if taken := sorted({one.name for one in self.parameters} & _TAKEN):
+            raise InputError(
+                f"'{taken[0]}' is a setting of the solver: name the parameter otherwise"
+            )
         if unknown := set(self.features) - set(known):
             raise InputError(f"problem '{self.name}' has no state or input {sorted(unknown)}")
+
+    def _check_sizes(self) -> None:
+        """Of the functions that C calls."""
+        sizes = [len(self.states), len(self.inputs), self.outputs]
+        for name, wanted in (("f", sizes), ("advance", [*sizes, 1])):
+            function = getattr(self, name)
+            found = [function.numel_in(i) for i in range(function.n_in())]
+            if found != wanted or function.numel_out(0) != sizes[0]:
+                raise InputError(
+                    f"problem '{self.name}': {name} takes {found} numbers and gives "
+                    f"{function.numel_out(0)}; expected {wanted} (states, inputs, outputs of the "
+                    f"residual{', duration' if name == 'advance' else ''}) and {sizes[0]}"
+                )
 
     def _check_rows(self) -> None:
         x = self.symbols.x

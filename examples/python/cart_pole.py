@@ -113,7 +113,6 @@ def problem(name: str, model: CartPole) -> br.Problem:
         outputs=2,
         symbols=s,
         f=f,
-        linearise=br.ocp.linearised(f),
         advance=ca.Function("br_advance", [s.x, s.u, e, s.h], [after(s.h)]),
         cost=state_cost * (1 + theta["q_last"] * s.last) + theta["r_force"] * s.u**2,
         rows=(br.ocp.Row("rail", position, -rail, rail, penalty=theta["w_rail"]),),
@@ -121,8 +120,6 @@ def problem(name: str, model: CartPole) -> br.Problem:
         u_upper=force_max,
         guess=s.share * force_max,
         acting=ca.fmin(ca.fmax(s.u, -force_max), force_max),
-        reached=s.x,
-        valid=force_max,
     )
 
 

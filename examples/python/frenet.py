@@ -100,11 +100,8 @@ def problem(car: br.Car, track: br.Track) -> br.Problem:
             parameter("right", "m"), parameter("left", "m"), parameter("speed", "m/s"),
         ),
         parameters=tuple(parameter(one, "1", positive=True) for one in PARAMETERS),
-        features=(),
-        outputs=0,
         symbols=s,
         f=f,
-        linearise=br.ocp.linearised(f),
         advance=ca.Function("br_advance", [s.x, s.u, e, s.h], [after(s.h)]),
         cost=cost,
         rows=(
@@ -116,8 +113,6 @@ def problem(car: br.Car, track: br.Track) -> br.Problem:
         u_upper=u_max,
         guess=ca.vertcat(s.share * theta["acceleration_max"] / 4, 0),
         acting=ca.fmin(ca.fmax(s.u, -u_max), u_max),
-        reached=s.x,
-        valid=theta["delta_max"],
     )  # fmt: skip
 
 

@@ -96,7 +96,8 @@ def main(folder: Path) -> dict[str, Any]:
         controller.weights = br.train(runs)
     built_in = driven(controller)
     print(f"built-in tracking: {built_in}")
-    own, results = br.Controller(car, track, line, problem=gentle(car)), {}
+    own = br.Controller(car, track, line, problem=gentle(car), parameters={"q_slide": 0.0})
+    results = {}
     own.weights = controller.weights
     for q in WEIGHTS:
         own.set_parameters(q_slide=q)
