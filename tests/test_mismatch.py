@@ -417,34 +417,25 @@ def slippery(race: Racing) -> Simulator:
 
 
 @pytest.mark.check
-@pytest.mark.parametrize(
-    ("sensors", "seeds", "usual_m", "worst_m"),
-    [(get_sensors("exact"), 1, 1e-3, 1e-3), (mocap(ROUGH), 9, 2e-3, 0.02)],
-    ids=["exact", "1 mm"],
-)
+@pytest.mark.parametrize("sensors", [get_sensors("exact"), mocap(ROUGH)], ids=["exact", "1 mm"])
 def test_a_car_that_has_lost_grip_since_it_was_learned_stays_on_the_track(
-    sensors: Sensors, seeds: int, usual_m: float, worst_m: float
+    sensors: Sensors,
 ) -> None:
-    """Under noise by some millimetres, and not in each run: two of five touch the edge."""
     race = racing("random:8")
-    deepest_m = np.zeros((2, seeds))
-    for row, mpc in enumerate((MpcSettings(caution=0.0), MpcSettings())):
-        for seed in range(seeds):
-            controller = compiled_controller(
-                race.artefact, race.car, race.track, race.line, race.weights, mpc
-            )
-            loop = ClosedLoop(
-                race.car, race.track, race.line, controller, slippery(race), sensors=sensors,
-                seed=seed,
-            )  # fmt: skip
-            driven = loop.drive(3)
-            deepest_m[row, seed] = driven.off_track_m.max()
-            if row:
-                assert len(driven.laps_s) == 3
-                assert driven.laps_s[2] < 6.0
-    assert np.median(deepest_m[0]) > 0.02
-    assert np.median(deepest_m[1]) < usual_m
-    assert deepest_m[1].max() < worst_m
+    deepest_m = []
+    for mpc in (MpcSettings(caution=0.0), MpcSettings()):
+        controller = compiled_controller(
+            race.artefact, race.car, race.track, race.line, race.weights, mpc
+        )
+        loop = ClosedLoop(
+            race.car, race.track, race.line, controller, slippery(race), sensors=sensors
+        )
+        driven = loop.drive(3)
+        deepest_m.append(float(driven.off_track_m.max()))
+    assert deepest_m[0] > 0.02
+    assert deepest_m[1] < 1e-3
+    assert len(driven.laps_s) == 3
+    assert driven.laps_s[2] < 6.0
 
 
 def test_estimates_that_the_mismatch_corrects_need_no_preparation(

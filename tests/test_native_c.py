@@ -11,7 +11,7 @@ from bayesrace.arrays import Floats
 from bayesrace.controller.native_step import NativeStep
 from bayesrace.gp.weights import Weights, zero_weights
 from bayesrace.vehicles import Car
-from tests.conftest import SETTINGS, Circuit, Problem, fit_weights, native_numbers
+from tests.conftest import SETTINGS, Circuit, Problem, native_numbers
 from tests.native_programs import (
     OPTIMISED,
     PROGRAMS,
@@ -38,24 +38,18 @@ def states(recorded: list[Problem]) -> Floats:
 
 
 @pytest.fixture(scope="module")
-def many(car: Car) -> Weights:
-    """Of more points than the variance has room for: they are chosen when weights are set."""
-    return fit_weights(car, ("rbf", "matern25", "matern15"), count=300)
-
-
-@pytest.fixture(scope="module")
 def problems(
     tmp_path_factory: pytest.TempPathFactory,
     recorded: list[Problem],
     circuit: Circuit,
-    many: Weights,
+    weights: Weights,
     car: Car,
 ) -> Path:
     """The harness' input file."""
     table = circuit.table
     parts = [
         np.r_[table.spacing_m, len(table.rows), table.rows.ravel()],
-        native_numbers(SETTINGS, car, many),
+        native_numbers(SETTINGS, car, weights),
         np.r_[STEPS, states(recorded).ravel()],
     ]
     path = tmp_path_factory.mktemp("native") / "problems.bin"
@@ -77,7 +71,7 @@ def test_the_control_loop_never_allocates_and_python_sees_the_same_bits(
     problems: Path,
     tmp_path: Path,
     car: Car,
-    many: Weights,
+    weights: Weights,
     circuit: Circuit,
     recorded: list[Problem],
 ) -> None:
@@ -90,7 +84,7 @@ def test_the_control_loop_never_allocates_and_python_sees_the_same_bits(
     assert set(np.unique(results[:, 1])) >= {1.0, 3.0, 6.0}  # acceptable, infeasible, bad state
 
     step = NativeStep(kinematic_artefact, car, SETTINGS)
-    step.set_weights(many)
+    step.set_weights(weights)
     step.set_path(circuit.table)
     # as the harness does, up to where it begins to spoil references
     for k, row in enumerate(states(recorded)[: STEPS // 2]):
@@ -98,7 +92,7 @@ def test_the_control_loop_never_allocates_and_python_sees_the_same_bits(
             if k % 100 == 40:
                 step.load_weights(b"")
             else:
-                step.set_weights(many)
+                step.set_weights(weights)
         if k % 97 == 96:
             step.reset()
         status = step.step(row[:7], float(row[7]))
@@ -114,14 +108,14 @@ def test_no_sanitizer_finds_anything(
     problems: Path,
     tmp_path: Path,
     car: Car,
-    many: Weights,
+    weights: Weights,
     request: pytest.FixtureRequest,
 ) -> None:
     folder: Path = request.getfixturevalue(artefact)
     flags = SANITIZED
     if artefact == "dynamic_artefact":  # its capacity is 8 points
         nothing = native_numbers(SETTINGS, car, zero_weights(car.name, "none"))
-        full = len(native_numbers(SETTINGS, car, many))
+        full = len(native_numbers(SETTINGS, car, weights))
         data = np.fromfile(problems)
         steps = data[-(8 * STEPS + 1) :]
         head = data[: len(data) - len(steps) - full]

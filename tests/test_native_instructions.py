@@ -1,7 +1,6 @@
 """The same library uses what the processor has: each instruction set against the same oracles."""
 
 import platform
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +12,6 @@ from bayesrace.errors import InputError
 from bayesrace.gp.expression import corrected_function
 from bayesrace.gp.weights import KERNELS
 from bayesrace.integrators import PREDICTION
-from bayesrace.learning.subset import most_informative
 from bayesrace.learning.validation import predictive_sigma
 from bayesrace.vehicles import Car
 from bayesrace.vehicles.models import e_kinematic
@@ -59,27 +57,6 @@ def test_model_and_variance_are_those_of_the_oracles(
     theirs = predictive_sigma(weights, vs[:, 3:]) ** 2
     prior = np.array([sum(output.amplitudes[2:]) for output in weights.outputs])
     np.testing.assert_allclose(ours / prior, theirs / prior, rtol=0, atol=1e-9)
-
-
-@pytest.mark.parametrize("kind", KERNELS)
-@pytest.mark.parametrize("name", NAMES)
-def test_the_points_that_count_are_those_of_the_oracle(
-    kinematic_artefact: Path, car: Car, kind: str, name: str
-) -> None:
-    """Of more than the variance has room for, the most informative ones, on any processor."""
-    weights = fit_weights(car, (kind, kind, kind), count=390)
-    step = using(NativeStep(kinematic_artefact, car, MpcSettings()), name)
-    step.set_weights(weights)
-    chosen = []
-    for one in weights.outputs:
-        ratio = one.noise_variance / one.signal_variance
-        rows = most_informative(one.kernel, one.inputs, one.length_scales, ratio, 256)
-        chosen.append(replace(one, inputs=one.inputs[rows], alpha=one.alpha[rows]))
-    vx, vy, omega = chosen
-    vs = points(car)
-    ours = np.array([step.variance(v)[0] for v in vs])
-    theirs = predictive_sigma(replace(weights, outputs=(vx, vy, omega)), vs[:, 3:]) ** 2
-    np.testing.assert_allclose(ours, theirs, rtol=1e-9)
 
 
 @pytest.mark.parametrize("name", NAMES)

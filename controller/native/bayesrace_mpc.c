@@ -319,7 +319,7 @@ static void exchange(br_mpc *mpc) {
 
 /* Into the spare buffer, which the caller has taken. */
 static br_mpc_error load(br_mpc *mpc, const br_mpc_gp outputs[BR_NE]) {
-    const br_mpc_error error = mpc->code->load(&mpc->gp[mpc->gp_spare], outputs, &mpc->choice);
+    const br_mpc_error error = mpc->code->load(&mpc->gp[mpc->gp_spare], outputs);
 #if BR_HAS_PATH
     if (!error) mpc->code->limit(mpc, mpc->gp_spare);
 #endif

@@ -314,7 +314,7 @@ void br_gp_clear(br_gp *gp) {
     }
 }
 
-br_mpc_error br_gp_load(br_gp *gp, const br_mpc_gp outputs[BR_NE], br_gp_choice *choice) {
+br_mpc_error br_gp_load(br_gp *gp, const br_mpc_gp outputs[BR_NE]) {
     for (int j = 0; j < BR_NE; ++j)
         if (!valid(&outputs[j])) return BR_ERROR_WEIGHTS;
     gp->any = gp->uncertain = 0;
@@ -322,7 +322,7 @@ br_mpc_error br_gp_load(br_gp *gp, const br_mpc_gp outputs[BR_NE], br_gp_choice 
     for (int j = 0; j < BR_NE; ++j) {
         /* finite numbers may overflow once scaled: refused here, not found out while driving */
         if (!load(&gp->output[j], &outputs[j])) return BR_ERROR_WEIGHTS;
-        br_variance_load(&gp->output[j], &outputs[j], &gp->variance[j], choice);
+        br_variance_load(&gp->output[j], &outputs[j], &gp->variance[j]);
         if (outputs[j].n || outputs[j].offset != 0.0) gp->any = 1;
         if (outputs[j].signal > 0) gp->uncertain = 1;
     }

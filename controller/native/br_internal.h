@@ -224,7 +224,7 @@ typedef struct {
     __typeof__(br_mpc_variance) *variance;
     __typeof__(br_mpc_get_mismatch) *mismatch;
     __typeof__(br_mpc_evaluate) *evaluate;
-    br_mpc_error (*load)(br_gp *gp, const br_mpc_gp outputs[BR_NE], br_gp_choice *choice);
+    br_mpc_error (*load)(br_gp *gp, const br_mpc_gp outputs[BR_NE]);
 #if BR_HAS_PATH
     void (*limit)(br_mpc *mpc, int buffer);
 #endif
@@ -298,10 +298,8 @@ struct br_mpc {
     double merit;   /* ... beside its cost */
     double worth;   /* cost, to first order, once the defects are gone: costates price them */
     br_mpc_info info;
-    /* The last members of br_mpc, so that memory for points that the weights do not have is never
-     * written to. */
-    br_gp gp[3];         /* in use, proven, spare */
-    br_gp_choice choice; /* belongs to the thread that has taken the spare one */
+    br_gp gp[3]; /* in use, proven, spare. The last member of br_mpc, so that memory for points that
+                    the weights do not have is never written to */
 };
 
 /* The result and all before it have to be computed again: what they are made from has changed. */

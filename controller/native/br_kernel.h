@@ -8,9 +8,9 @@
 #define BR_GP_BLOCK 128 /* training points that are taken at a time: in the first-level cache */
 #define BR_GP_BLOCKS ((BR_GP_CAPACITY + BR_GP_BLOCK - 1) / BR_GP_BLOCK)
 #define BR_GP_PADDED (BR_GP_BLOCKS * BR_GP_BLOCK)
-/* Training points that the posterior variance is exact with: its memory, and its time in each step,
- * grow with the square. */
-#define BR_GP_ROOT (BR_GP_CAPACITY < 256 ? (BR_GP_CAPACITY + 7) / 8 * 8 : 256)
+/* Training points that the posterior variance is exact with: the memory for it grows with the
+ * square. */
+#define BR_GP_ROOT (BR_GP_CAPACITY < 512 ? (BR_GP_CAPACITY + 7) / 8 * 8 : 512)
 #define BR_ROOT_TILE 8 /* rows of a triangular matrix that are stored together */
 #define BR_ROOT_SIZE(n) \
     ((n) * ((n) + BR_ROOT_TILE) / 2)      /* numbers of n rows, whole tiles of them */
@@ -37,14 +37,6 @@ typedef struct {
     double inputs[BR_NZ][BR_GP_ROOT];
     BR_ALIGNED double root[BR_ROOT_SIZE(BR_GP_ROOT)];
 } br_gp_variance;
-
-/* Workspace for choosing the points that count, in tiles of so many; of none if all do. */
-#define BR_GP_TILES (BR_GP_CAPACITY > BR_GP_ROOT ? (BR_GP_CAPACITY + 7) / BR_ROOT_TILE : 1)
-
-typedef struct {
-    BR_ALIGNED double left[BR_ROOT_TILE * BR_GP_TILES]; /* variances given the points taken */
-    BR_ALIGNED double factor[BR_GP_TILES][BR_GP_ROOT][BR_ROOT_TILE];
-} br_gp_choice;
 
 typedef struct {
     int any; /* 0 while every output is constant zero: WorstCase and BestCase skip the kernels */
@@ -75,13 +67,12 @@ BR_PART void br_gp_curvature(const br_gp *gp, int stages, double (*z)[BR_NZ], br
                              double (*out)[BR_NZ][BR_NZ]);
 BR_PART void br_gp_clear(br_gp *gp);
 BR_PART void br_gp_mean(const br_gp *gp, const double z[BR_NZ], double mean[BR_NE]);
-BR_PART br_mpc_error br_gp_load(br_gp *gp, const br_mpc_gp outputs[BR_NE], br_gp_choice *choice);
+BR_PART br_mpc_error br_gp_load(br_gp *gp, const br_mpc_gp outputs[BR_NE]);
 
 /* --- br_variance.c --- */
 
 /* Of one output whose weights are loaded. */
-BR_PART void br_variance_load(const br_gp_output *gp, const br_mpc_gp *in, br_gp_variance *v,
-                              br_gp_choice *choice);
+BR_PART void br_variance_load(const br_gp_output *gp, const br_mpc_gp *in, br_gp_variance *v);
 /* Noise included, of several stages; 0 where it is not known. */
 BR_PART void br_gp_variances(const br_gp *gp, int stages, double (*z)[BR_NZ],
                              double (*work)[BR_COLUMNS], double (*variance)[BR_NE]);

@@ -4,9 +4,9 @@
  *
  * with the correlations K among the training points and k(z) with z (Rasmussen and Williams,
  * "Gaussian Processes for Machine Learning", algorithm 2.1; W is the inverse of the Cholesky
- * factor). Exact for up to BR_GP_ROOT points; of more, the most informative so many count, which
- * leaves a larger variance, never a smaller one. They are chosen, and W is made, when weights are
- * loaded, by the thread that stages them. W k of all stages is a product of two matrices.
+ * factor). Exact for up to BR_GP_ROOT points; of more, so many evenly spread ones count, which
+ * leaves a larger variance, never a smaller one. W is made when weights are loaded, by the thread
+ * that stages them. W k of all stages is a product of two matrices.
  */
 #include "br_internal.h"
 
@@ -48,62 +48,19 @@ static void query(const br_gp_variance *v, int first, int rows, double q[BR_NZ][
     }
 }
 
+/* The training points that count; zeros after them. */
+static void choose(const br_gp_output *gp, int count, br_gp_variance *v) {
+    v->kernel = gp->kernel;
+    v->count = count < BR_GP_ROOT ? count : BR_GP_ROOT;
+    for (int i = 0; i < BR_GP_ROOT; ++i) {
+        const int from = i < v->count ? (int)((2LL * i + 1) * count / (2 * v->count)) : 0;
+        for (int a = 0; a < BR_NZ; ++a) v->inputs[a][i] = i < v->count ? gp->inputs[a][from] : 0;
+    }
+}
+
 /* Rows of a triangular matrix from one of BR_ROOT_TILE rows on, column by column: (i, j) is [j][i %
  * BR_ROOT_TILE]. */
 typedef double tile_column[BR_ROOT_TILE];
-
-/* One point more: that of the largest variance given those taken before. A column more of the
- * factor, for all points, says what their variances are then. */
-static void take(const br_gp_output *gp, double noise, int count, int taken, br_gp_variance *v,
-                 br_gp_choice *choice) {
-    int pivot = 0;
-    for (int i = 1; i < count; ++i)
-        if (choice->left[i] > choice->left[pivot]) pivot = i;
-    double row[BR_GP_ROOT];
-    const tile_column *own = choice->factor[pivot / BR_ROOT_TILE];
-    for (int s = 0; s < taken; ++s) row[s] = own[s][pivot % BR_ROOT_TILE];
-    for (int a = 0; a < BR_NZ; ++a) v->inputs[a][taken] = gp->inputs[a][pivot];
-    const double square = br_worse(0.0, choice->left[pivot]) + noise;
-    const double scale = square > LEAST_PIVOT ? 1.0 / sqrt(square) : 0.0;
-    for (int first = 0; first < count; first += BR_ROOT_TILE) {
-        tile_column *factor = choice->factor[first / BR_ROOT_TILE];
-        BR_ALIGNED double q[BR_NZ][BR_COLUMNS];
-        for (int a = 0; a < BR_NZ; ++a) memcpy(q[a], &gp->inputs[a][first], sizeof q[a]);
-        query(v, taken, 1, q, factor + taken);
-        br_vec column[VECTORS];
-        BR_UNROLL
-        for (int p = 0; p < VECTORS; ++p) column[p] = br_load(&factor[taken][BR_LANES * p]);
-        for (int s = 0; s < taken; ++s) BR_UNROLL
-        for (int p = 0; p < VECTORS; ++p) column[p] -= row[s] * br_load(&factor[s][BR_LANES * p]);
-        for (int p = 0; p < VECTORS; ++p) {
-            double *left = &choice->left[first + BR_LANES * p];
-            column[p] *= scale;
-            br_store(&factor[taken][BR_LANES * p], column[p]);
-            br_store(left, br_load(left) - column[p] * column[p]);
-        }
-    }
-    choice->left[pivot] = -INFINITY;
-}
-
-/* The training points that count, in their order; zeros after them. Of too many those are taken
- * of which the others say least, by a pivoted Cholesky factorisation as in
- * bayesrace/learning/subset.py: evenly spread ones would leave out what was driven once only. */
-static void choose(const br_gp_output *gp, double noise, int count, br_gp_variance *v,
-                   br_gp_choice *choice) {
-    v->kernel = gp->kernel;
-    if (count > BR_GP_ROOT) {
-        for (int i = 0; i < gp->n_padded; ++i) choice->left[i] = 1.0;
-        for (int taken = 0; taken < BR_GP_ROOT; ++taken) take(gp, noise, count, taken, v, choice);
-    }
-    v->count = 0;
-    memset(v->inputs, 0, sizeof v->inputs);
-    /* the bound is for inputs so far apart that correlations overflow */
-    for (int i = 0; i < count && v->count < BR_GP_ROOT; ++i) {
-        if (count > BR_GP_ROOT && choice->left[i] != -INFINITY) continue;
-        for (int a = 0; a < BR_NZ; ++a) v->inputs[a][v->count] = gp->inputs[a][i];
-        v->count += 1;
-    }
-}
 
 static tile_column *rows_from(br_gp_variance *v, int first) {
     return (tile_column *)&v->root[BR_ROOT_SIZE(first)];
@@ -183,16 +140,14 @@ static void invert(br_gp_variance *v, int first, tile_column *m) {
     }
 }
 
-void br_variance_load(const br_gp_output *gp, const br_mpc_gp *in, br_gp_variance *v,
-                      br_gp_choice *choice) {
+void br_variance_load(const br_gp_output *gp, const br_mpc_gp *in, br_gp_variance *v) {
     v->signal = in->signal;
     v->noise = in->signal > 0 ? in->noise : 0;
     v->count = 0;
     if (!(v->signal > 0)) return;
-    const double noise = in->noise / in->signal;
-    choose(gp, noise, in->n, v, choice);
+    choose(gp, in->n, v);
     for (int first = 0; first < v->count; first += BR_ROOT_TILE) {
-        correlate(v, noise, first, rows_from(v, first));
+        correlate(v, in->noise / in->signal, first, rows_from(v, first));
         factorise(v, first, rows_from(v, first));
     }
     for (int first = 0; first < v->count; first += BR_ROOT_TILE)
