@@ -658,3 +658,15 @@ def test_a_closed_simulator_is_not_used(orca: br.Car, harbour: br.Track) -> None
         simulator.reset()
     with pytest.raises(br.InputError, match="has been closed"):
         simulator.step((0.1, 0.0))
+
+
+def test_weights_correct_a_problem_of_ones_own(
+    controller: br.Controller, weights: br.Weights
+) -> None:
+    """Also one with parameters that have to be above 0."""
+    weighed = own(controller.car, cost_weights=(br.ocp.Parameter("q_slip", "1", positive=True),))
+    mine = br.Controller(
+        controller.car, controller.track, controller.line,
+        problem=weighed, parameters={"q_slip": 1.0}, weights=weights,
+    )  # fmt: skip
+    assert mine.weights is weights

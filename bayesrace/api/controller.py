@@ -173,6 +173,7 @@ class Controller:
         self._predictive: PredictiveController = compiled_controller(
             self.artefact, car, track, self.line, None, tuned, parameters=parameters
         )
+        self._parameters = dict(parameters or {})
         compensation = {} if delay_s is None else {"mode": "fixed", "delay_s": delay_s}
         self._cycle_settings = validated(CycleSettings, {"compensation": compensation})
         self._driver = Driver(self._predictive, car, self._cycle_settings)
@@ -213,7 +214,7 @@ class Controller:
                 "Weights.from_sklearn returns"
             )
         else:
-            checks = Checks(GateSettings(), self.artefact, self.car)
+            checks = Checks(GateSettings(), self.artefact, self.car, self._parameters)
             recent = Samples(*self.native.samples())
             packed = checks.check_start(encode_weights(weights), recent)
             self.native.load_weights(packed, weights.version)

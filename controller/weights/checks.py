@@ -82,9 +82,16 @@ class Verdict(NamedTuple):
 class Checks:
     """The tests for one controller."""
 
-    def __init__(self, settings: GateSettings, artefact: Path, car: Car) -> None:
+    def __init__(
+        self,
+        settings: GateSettings,
+        artefact: Path,
+        car: Car,
+        parameters: Mapping[str, float] | None = None,
+    ) -> None:
+        """``parameters``: as of :class:`.NativeStep`."""
         self._settings, self._car = settings, car
-        self._step = NativeStep(artefact, car, MpcSettings())
+        self._step = NativeStep(artefact, car, MpcSettings(), parameters)
         self._step_s = self._step.manifest.step_s
         self._slack = slack_of(car, self._step_s)
 
