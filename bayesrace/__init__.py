@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from bayesrace import ocp as ocp
     from bayesrace import testing as testing
     from bayesrace.api.controller import Controller as Controller
-    from bayesrace.api.controller import Status as Status
     from bayesrace.api.controller import Step as Step
     from bayesrace.api.controller import Times as Times
     from bayesrace.api.logs import Log as Log
@@ -41,6 +40,7 @@ if TYPE_CHECKING:
     from bayesrace.api.values import State as State
     from bayesrace.codegen.problems.problem import Problem as Problem
     from bayesrace.controller.driver import Level as Level
+    from bayesrace.controller.native_step import Status as Status
     from bayesrace.errors import InputError as InputError
     from bayesrace.gp.weights import Weights as Weights
     from bayesrace.raceline import RaceLine as RaceLine
@@ -57,7 +57,7 @@ _PLACES: Final = {
     "Mpc": "api.mpc", "OwnSimulator": "api.simulator", "Problem": "codegen.problems.problem",
     "RaceLine": "raceline", "RaceLineSettings": "raceline", "Run": "api.runs",
     "Simulator": "api.simulator", "Solution": "api.mpc", "State": "api.values",
-    "Status": "api.controller",
+    "Status": "controller.native_step",
     "Step": "api.controller", "Times": "api.controller", "Track": "tracks",
     "Weights": "gp.weights", "drive": "api.runs", "gym": "", "ocp": "",
     "racing_line": "raceline", "residuals": "api.training", "testing": "",

@@ -45,12 +45,12 @@ Start = Literal["line", "random"]
 _AHEAD: Final = tuple(range(0, 48, 4))
 """Places at which curvature is seen [wheelbases]."""
 _WIDEST: Final = 20.0
-"""Widths of a track that are told apart [wheelbases]."""
+"""Largest width of a track in an observation [wheelbases]."""
 _FARTHEST: Final = 2.0
-"""Offsets that are told apart [widths on that side]."""
+"""Largest offset in an observation [widths on that side]."""
 _FASTEST: Final = 4.0
-"""Yaw rates that are told apart, in terms of that of the tightest bend at the limit of friction; a
-car that spins is faster than that."""
+"""Largest yaw rate in an observation, over that of the tightest bend at the limit of friction; it
+clips that of a car that spins."""
 _SLOW: Final = 0.1
 """Share of the top speed at which an episode without ``max_time_s`` ends after its laps ..."""
 _SLOW_S: Final = 2.0

@@ -12,7 +12,7 @@ from pydantic import BaseModel, ValidationError
 
 from bayesrace.arrays import Floats
 from bayesrace.controller.interface import StepOutput
-from bayesrace.controller.native_step import Artefact, NativeStep, StepStatus
+from bayesrace.controller.native_step import Artefact, NativeStep, Status
 from bayesrace.controller.settings import GateSettings, MpcSettings
 from bayesrace.controller.weights.adoption import WeightsPort
 from bayesrace.controller.weights.checks import Checks
@@ -148,7 +148,7 @@ class PredictiveController:
         self.native.read_plan()
         self.native.read_tube()
         # Acceptable and converged may both be driven; the residuals below distinguish them.
-        output.status = 0 if info.status <= StepStatus.ACCEPTABLE else info.status
+        output.status = 0 if info.status <= Status.ACCEPTABLE else info.status
         output.cost = info.cost
         output.cost_shifted = info.shifted_cost if info.shifts >= 0 else -1.0
         output.second_start = info.second_start

@@ -13,6 +13,7 @@ from typing import Any, Final
 
 from bayesrace.controller.estimator import Belief, Measurement, fill, read
 from bayesrace.controller.interface import Controller, Environment, StepOutput
+from bayesrace.controller.native_step import Status
 from bayesrace.controller.settings import CycleSettings, MpcSettings
 from bayesrace.messages import (
     MOST_INSTRUMENTS,
@@ -26,20 +27,11 @@ from bayesrace.messages import (
 from bayesrace.vehicles.parameters import Car
 
 __all__ = [
-    "DOUBTED",
-    "HALTED",
-    "NO_STATE",
-    "STEP_FAILED",
-    "UNPREDICTABLE",
     "Decision",
     "Driver",
     "Level",
     "Phase",
 ]
-
-DOUBTED, UNPREDICTABLE, HALTED, NO_STATE, STEP_FAILED = range(251, 256)
-"""Statuses of a cycle without a result of a step: br_no_step in
-controller/native/bayesrace_cycle.h."""
 
 
 class Level(IntEnum):
@@ -77,7 +69,7 @@ class Decision:
     d: float = 0.0
     delta_rate: float = 0.0
     level: Level = Level.STOP
-    status: int = HALTED
+    status: int = Status.HALTED
     decided_at_s: float = 0.0
     """Plant time at which the cycle began, as of :class:`Actuation`."""
     delay_s: float = 0.0
@@ -204,7 +196,7 @@ class Driver:
     def fallen_back(self) -> bool | None:
         """Whether the newest input was the fallback's for want of a solution; None: the car is
         not driven, or its state is not known."""
-        if self.decision.status in (HALTED, NO_STATE):
+        if self.decision.status in (Status.HALTED, Status.NO_STATE):
             return None
         return self.decision.level is not Level.SOLUTION
 
@@ -336,7 +328,7 @@ class Driver:
         decision.decided_at_s, decision.delay_s = decided.decided_at_s, decided.delay_s
         decision.fault = decided.fault
         decision.step_us, decision.stepped = decided.step_us, bool(decided.stepped)
-        if decision.status == STEP_FAILED:
+        if decision.status == Status.STEP_FAILED:
             text = self._library.br_mpc_error_text(decided.error)
             self.last_error = self.controller.last_error or self.controller.artefact.text(text)
         return decision

@@ -26,7 +26,7 @@ from bayesrace.vehicles import Car
 if TYPE_CHECKING:
     from bayesrace.controller.assembly import PathTable
 
-__all__ = ["PATH_COLUMNS", "Artefact", "NativeProblem", "NativeStep", "Reference", "StepStatus"]
+__all__ = ["PATH_COLUMNS", "Artefact", "NativeProblem", "NativeStep", "Reference", "Status"]
 
 PATH_COLUMNS: Final = 7
 """BR_PATH_COLUMNS in controller/native/bayesrace_mpc.h."""
@@ -35,23 +35,42 @@ Reference = Floats
 """Parameters of the stages 1..N, shape (N, np), in the order of the manifest."""
 
 
-class StepStatus(IntEnum):
-    """What became of the optimisation problem: br_mpc_status in controller/native/bayesrace_mpc.h,
-    which says what each means."""
+class Status(IntEnum):
+    """What became of a step's optimisation problem, or why there was none; 0 and 1 are driven. The
+    numbers are this project's, not those of other solvers: br_mpc_status in
+    controller/native/bayesrace_mpc.h and, from 251 on, br_no_step in bayesrace_cycle.h."""
 
     CONVERGED = 0
+    """Solved to the tolerance; of a :class:`Step` also what is acceptable."""
     ACCEPTABLE = 1
+    """Not to the tolerance, but the plan follows the model and keeps the bounds."""
     DEFECT = 2
+    """The plan does not follow the model."""
     INFEASIBLE = 3
+    """A quadratic programme has no solution: hard bounds contradict each other."""
     QP_LIMIT = 4
+    """A quadratic programme took too many iterations."""
     NOT_FINITE = 5
+    """A number is not finite, as of a cost that is not convex in the states."""
     BAD_STATE = 6
+    """The state, or the input before, is absurd."""
     TIME_LIMIT = 7
+    """The time was up before there was a usable plan."""
+    DOUBTED = 251
+    """States contradict each other, for longer than they may be old."""
+    UNPREDICTABLE = 252
+    """The state could not be predicted to the moment of acting."""
+    HALTED = 253
+    """The car is not to be driven."""
+    NO_STATE = 254
+    """The newest one is too old."""
+    STEP_FAILED = 255
+    """The step itself is broken."""
 
     @property
     def usable(self) -> bool:
         """Whether the first input may go to the actuators."""
-        return self <= StepStatus.ACCEPTABLE
+        return self <= Status.ACCEPTABLE
 
 
 class Artefact:
@@ -125,7 +144,7 @@ class NativeProblem:
         problem, n = self.manifest.problem, self.manifest.horizon
         self._nx, self._nu = nx, nu = len(problem.states), len(problem.inputs)
         self._reference_shape = (n, len(problem.stage_parameters))
-        self._parameters = ffi.new("br_mpc_parameters *")
+        self._parameters, self._complete = ffi.new("br_mpc_parameters *"), False
         self.info, self._status = ffi.new("br_mpc_info *"), ffi.new("br_mpc_status *")
         # Made once: to make arguments of arrays takes longer than to copy into these.
         self._x, self._x_given = self._made(nx)
@@ -182,6 +201,10 @@ class NativeProblem:
                 f"problem '{self.manifest.problem.name}' has no parameter {', '.join(unknown)}; "
                 f"it has {', '.join(known)}"
             )
+        names = [] if self._complete else [one.name for one in self.manifest.problem.parameters]
+        if missing := [name for name in names if name not in values]:
+            problem = self.manifest.problem.name
+            raise InputError(f"parameters: {', '.join(missing)} of '{problem}' are missing")
         given = self._ffi.new("br_mpc_parameters *", self._parameters[0])
         for name, value in values.items():
             try:
@@ -191,7 +214,7 @@ class NativeProblem:
         error = self._library.br_mpc_set_parameters(self.handle, given)
         if error:
             self._check(error, f"parameters ({', '.join(self._doubtful(given)) or 'their limits'})")
-        self._parameters = given
+        self._parameters, self._complete = given, True
 
     def _doubtful(self, parameters: Any) -> list[str]:
         """Those of the problem whose values it does not allow, with these."""
@@ -290,7 +313,7 @@ class NativeProblem:
         elapsed_s: float | None = None,
         budget_s: float = 0.0,
         environment: Environment | None = None,
-    ) -> StepStatus:
+    ) -> Status:
         """One control step from the measured state x (nx,); results in ``u`` and ``info``.
 
         ``u_before`` (nu,): the input that acts now; a number stands for all components.
@@ -312,13 +335,13 @@ class NativeProblem:
         *,
         elapsed_s: float | None = None,
         budget_s: float = 0.0,
-    ) -> StepStatus:
+    ) -> Status:
         """As :meth:`step`, with the stage parameters (N, np) of another planner."""
         numbers = self._given("reference", reference, *self._reference_shape)
         stages = self._ffi.cast("br_mpc_reference *", numbers)
         return self._solved("solve", x, u_before, self._elapsed(elapsed_s), budget_s, stages)
 
-    def _solved(self, what: str, x: Floats, u_before: npt.ArrayLike, *arguments: Any) -> StepStatus:
+    def _solved(self, what: str, x: Floats, u_before: npt.ArrayLike, *arguments: Any) -> Status:
         if np.shape(x) != (self._nx,):
             raise InputError(f"x has shape {np.shape(x)}, not ({self._nx},)")
         self._x[:], self._u_before[:] = x, u_before
@@ -326,7 +349,7 @@ class NativeProblem:
         results = self._u, self._status, self.info
         call = getattr(self._library, f"br_mpc_{what}")
         self._check(call(self.handle, *given, *arguments, *results), what)
-        return StepStatus(self._status[0])
+        return Status(self._status[0])
 
     def _elapsed(self, elapsed_s: float | None) -> float:
         return self.manifest.step_s if elapsed_s is None else elapsed_s
@@ -465,10 +488,6 @@ class NativeStep(NativeProblem):
         self.manifest.check_car(car, artefact)
         self._line_mps, self._spacing_m = np.zeros(0), 0.0
         values = settings.parameters(car, self.manifest.problem.name) | dict(parameters or {})
-        names = [one.name for one in self.manifest.problem.parameters]
-        if missing := [name for name in names if name not in values]:
-            problem = self.manifest.problem.name
-            raise InputError(f"parameters: {', '.join(missing)} of '{problem}' are missing")
         self.set_values(values)
 
     def set_parameters(self, car: Car, settings: MpcSettings) -> None:

@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 
 from bayesrace.arrays import Floats
-from bayesrace.controller.driver import DOUBTED, STEP_FAILED
 from bayesrace.controller.interface import ControlLaw, Environment, StepOutput
-from bayesrace.controller.native_step import NativeProblem
+from bayesrace.controller.native_step import NativeProblem, Status
 
 __all__ = ["PythonController"]
 
@@ -45,7 +44,7 @@ class PythonController:
             "reset": self._reset,
         }  # without "steer": braking, its steering is held
         # An interrupt may strike before a function's own handler; the call fails then, too.
-        failed = {"step": STEP_FAILED, "predict": -1}
+        failed = {"step": Status.STEP_FAILED, "predict": -1}
         self._functions = {
             name: ffi.callback(types[name].type, function, failed.get(name), self._struck)
             for name, function in functions.items()
@@ -96,17 +95,17 @@ class PythonController:
         solution: Any,
     ) -> int:
         if not self._was_reset:
-            return STEP_FAILED
+            return Status.STEP_FAILED
         try:
             around = Environment(*(getattr(environment, name) for name in Environment._fields))
             given = self._array(x, 7), self._array(u_before, 2)
             output = self.law.step(*given, around, elapsed_s, budget_s)
             self._fill(solution, output)
-            if not 0 <= output.status < DOUBTED:
-                raise ValueError(f"status {output.status} is not from 0 to {DOUBTED - 1}")
+            if not 0 <= output.status < Status.DOUBTED:
+                raise ValueError(f"status {output.status} is not from 0 to {Status.DOUBTED - 1}")
         except BaseException as error:
             self._caught(error)
-            return STEP_FAILED
+            return Status.STEP_FAILED
         self._result = output
         return output.status
 

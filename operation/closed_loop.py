@@ -106,7 +106,7 @@ class Driven(Trajectory):
     @cached_property
     def laps(self) -> LapTimes:
         """Interpolated within the sampling period."""
-        return time_laps(self.track, self.time_s, self.x[:, :2], self._projected.s_m)
+        return time_laps(self.track, self.time_s, self.x[:, :2], self.projected.s_m)
 
     @property
     def laps_s(self) -> tuple[float, ...]:
@@ -118,7 +118,7 @@ class Driven(Trajectory):
         """How far off the track the counted samples are: those up to the end of the last lap, or
         all of a run without one. Negative on the track."""
         counted = self.laps.after[-1] if self.laps.after else len(self.x)
-        return self._projected.off_track_m[:counted]
+        return self.projected.off_track_m[:counted]
 
     @property
     def fallbacks(self) -> int:
@@ -126,7 +126,8 @@ class Driven(Trajectory):
         return int((self.levels > 0).sum())
 
     @cached_property
-    def _projected(self) -> PathProjection:
+    def projected(self) -> PathProjection:
+        """Where the true states are on the track."""
         return self.track.project_path(self.x[:, :2])
 
     def samples(self) -> Dataset:

@@ -16,7 +16,7 @@ from bayesrace.messages import Reading, RunRequest, State, Truth
 from bayesrace.plant.sensors import SensorPlayer
 from bayesrace.plant.vehicle import FmuFault, Vehicle
 from bayesrace.sensors import EXACT, Sensors
-from bayesrace.tracks.track import CrossingLine
+from bayesrace.tracks.track import Crossing, CrossingLine
 
 __all__ = ["CarRun", "End", "LineCounter", "drive_lockstep", "fault_end", "truth_behind"]
 
@@ -63,13 +63,16 @@ class LineCounter:
         """Begin at a position, without a crossing so far."""
         self._at, self._past = (x_m, y_m), self._line.is_past(x_m, y_m)
         self.crossings = 0
+        self.newest = Crossing(0, 0.0)
+        """The last one, on the way between the two positions that it is between."""
 
     def move(self, x_m: float, y_m: float) -> int:
         """Crossings so far, after the car moved here."""
         before, was_past = self._at, self._past
         self._at, self._past = (x_m, y_m), self._line.is_past(x_m, y_m)
         if self._past != was_past:
-            self.crossings += self._line.crossing(before, self._at).direction
+            self.newest = self._line.crossing(before, self._at)
+            self.crossings += self.newest.direction
         return self.crossings
 
 
@@ -111,8 +114,7 @@ class CarRun:
             request.line_right_m,
         )
         vehicle.reset(request.x0)
-        start = vehicle.x.tolist() if vehicle.real or vehicle.places_itself else request.x0
-        self._line.restart(start[0], start[1])
+        self._line.restart(float(vehicle.x[0]), float(vehicle.x[1]))
 
     @property
     def laps(self) -> int:

@@ -167,8 +167,6 @@ class Vehicle(ABC):
     real: ClassVar[bool] = False
     """Whether it is a real car, whose true state is not known: it does not wait for its periods,
     a command acts at once (:meth:`actuate`), and its runs end when it stands."""
-    places_itself: ClassVar[bool] = False
-    """Whether it may begin elsewhere than it is told."""
     command_s: float = 0.0
     """From sending a command to its acting."""
 

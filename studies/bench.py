@@ -27,7 +27,7 @@ from bayesrace.codegen.problems.tracking import tracking
 from bayesrace.codegen.settings import ProblemName
 from bayesrace.controller.assembly import PredictiveController, compiled_controller
 from bayesrace.controller.cycle import Cycle
-from bayesrace.controller.native_step import NativeStep, StepStatus
+from bayesrace.controller.native_step import NativeStep, Status
 from bayesrace.controller.process_settings import ControllerSettings
 from bayesrace.controller.settings import MpcSettings
 from bayesrace.gp.expression import corrected_function
@@ -310,7 +310,7 @@ class _Drive:
         plan = plan_x.copy(), plan_u.copy()
         solution = _Solution(x, state.u_applied[0], native.read_reference(), plan)
         memory[:] = before
-        return solution if status is StepStatus.CONVERGED else None
+        return solution if status is Status.CONVERGED else None
 
 
 def _row(problem: ProblemName, caution: float, part: Part, steps: list[_Steps]) -> Row:

@@ -18,7 +18,7 @@ from bayesrace.arrays import Floats
 from bayesrace.codegen.fmu import FmuDefinition, controller_fmu, pack
 from bayesrace.controller.assembly import PredictiveController
 from bayesrace.controller.driver import Driver
-from bayesrace.controller.native_step import NativeStep, StepStatus
+from bayesrace.controller.native_step import NativeStep, Status
 from bayesrace.controller.process_settings import ControllerSettings
 from bayesrace.controller.settings import CompensationSettings, FallbackSettings
 from bayesrace.gp.weights import Weights
@@ -204,5 +204,5 @@ def same(rows: Floats, run: Lockstep, tolerance: float = 0.0) -> None:
     """To the bit, or but for rounding; whatever a good status is called."""
     expected = [(*u, *said) for u, said in zip(run.u, run.said, strict=True)]
     rows = rows.copy()
-    rows[rows[:, 2] == StepStatus.ACCEPTABLE, 2] = 0
+    rows[rows[:, 2] == Status.ACCEPTABLE, 2] = 0
     np.testing.assert_allclose(rows, np.array(expected), rtol=0, atol=tolerance)

@@ -8,7 +8,7 @@ from bayesrace.arrays import Floats
 from bayesrace.codegen.ocp import OcpNlp
 from bayesrace.codegen.problems.problem import Problem
 from bayesrace.codegen.settings import BuildSettings
-from bayesrace.controller.native_step import NativeProblem, StepStatus
+from bayesrace.controller.native_step import NativeProblem, Status
 from bayesrace.vehicles import Car, default_car
 from tests.test_problems import (
     HORIZON,
@@ -57,7 +57,7 @@ def test_from_a_constant_guess_it_solves_to_the_solution_of_ipopt(
     active = {"hard": 0, "lane": 0, "input": 0, "obstacle": 0}
     for k in range(12):
         native.reset()
-        assert native.solve(x, u, stages(k)) is StepStatus.CONVERGED
+        assert native.solve(x, u, stages(k)) is Status.CONVERGED
         plan_x, plan_u = (part.copy() for part in native.read_plan())
         assert spans(plan_u).max() < 1e-12
         assert np.ptp(plan_u[3:], axis=0).max() > 0.01
@@ -89,7 +89,7 @@ def test_a_shifted_plan_changes_by_blocks_and_no_such_change_is_better(
     for k in range(8):
         before = native.read_plan()[1].copy()
         shifted = np.vstack([before[1:], before[-1] * [1, 1, 0]])
-        assert native.solve(x, u, stages(k)) is StepStatus.CONVERGED
+        assert native.solve(x, u, stages(k)) is Status.CONVERGED
         plan_x, plan = (part.copy() for part in native.read_plan())
         if k:
             assert spans(plan - shifted).max() < 1e-12

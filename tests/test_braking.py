@@ -15,7 +15,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from bayesrace.controller.driver import NO_STATE, Level
+from bayesrace.controller.driver import Level
+from bayesrace.controller.native_step import Status
 from bayesrace.errors import InputError
 from bayesrace.log import LogReader
 from bayesrace.messages import TRUTH, BrakingPlan, State
@@ -80,7 +81,7 @@ def test_a_car_that_is_cut_off_stops_on_its_track(race: Racing, loss: type[Close
         deepest.append(race.off_track_m(driven.x))
     assert max(deepest) <= 0
     if loss is Silent:
-        assert loop.decided == (NO_STATE, Level.STOP)  # type: ignore[attr-defined]
+        assert loop.decided == (Status.NO_STATE, Level.STOP)  # type: ignore[attr-defined]
 
 
 def test_the_plan_begins_with_what_would_be_driven_anyway(race: Racing) -> None:

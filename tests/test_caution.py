@@ -11,7 +11,7 @@ from rich.console import Console
 from bayesrace.arrays import Floats
 from bayesrace.codegen.problems.tracking import tracking
 from bayesrace.controller.assembly import compiled_controller
-from bayesrace.controller.native_step import NativeStep, StepStatus
+from bayesrace.controller.native_step import NativeStep, Status
 from bayesrace.controller.pure_pursuit import PurePursuitSettings
 from bayesrace.controller.settings import MpcSettings
 from bayesrace.gp.weights import KERNELS, Weights, read_weights
@@ -166,7 +166,7 @@ def test_the_reference_does_not_leap_when_nothing_is_uncertain_any_more(
     """As after a rollback to no weights."""
     step = make(noisy(weights, 100), caution=0.95)
     x, u, paces = driven(step, car, circuit.start(), np.zeros(2), 40)
-    assert step.step(np.full(7, np.nan), u) is StepStatus.BAD_STATE
+    assert step.step(np.full(7, np.nan), u) is Status.BAD_STATE
     assert step.info.pace == paces[-1]  # also that of a step that plans nothing
     step.load_weights(b"")
     assert step.step(x, u).usable

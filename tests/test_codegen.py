@@ -24,15 +24,10 @@ from bayesrace.codegen.problems.driving import linearise_function
 from bayesrace.codegen.problems.problem import Problem
 from bayesrace.codegen.settings import BuildSettings
 from bayesrace.controller.driver import (
-    DOUBTED,
-    HALTED,
-    NO_STATE,
-    STEP_FAILED,
-    UNPREDICTABLE,
     Level,
     Phase,
 )
-from bayesrace.controller.native_step import Artefact, NativeStep, StepStatus
+from bayesrace.controller.native_step import Artefact, NativeStep, Status
 from bayesrace.controller.settings import SAMPLES, WATCHED, MpcSettings
 from bayesrace.errors import InputError
 from bayesrace.integrators import PERFECT, PREDICTION, Discretisation
@@ -425,10 +420,11 @@ def test_nothing_is_built_where_it_would_not_be_loaded(cache: Path, tmp_path: Pa
 
 def test_the_names_and_numbers_in_python_are_those_of_the_header(kinematic_artefact: Path) -> None:
     artefact = Artefact(kinematic_artefact)
-    no_steps = {"DOUBTED": DOUBTED, "UNPREDICTABLE": UNPREDICTABLE, "HALTED": HALTED,
-                "NO_STATE": NO_STATE, "STEP_FAILED": STEP_FAILED}  # fmt: skip
+    statuses = Status.__members__
+    of_steps = {name: one for name, one in statuses.items() if one < Status.DOUBTED}
+    no_steps = {name: one for name, one in statuses.items() if one >= Status.DOUBTED}
     tables: dict[str, tuple[str, Iterable[str]]] = {
-        "br_mpc_status": ("", StepStatus.__members__),
+        "br_mpc_status": ("", of_steps),
         "br_level": ("", Level.__members__),
         "br_no_step": ("", no_steps),
         "br_phase": ("PHASE_", Phase.__members__),
@@ -440,6 +436,7 @@ def test_the_names_and_numbers_in_python_are_those_of_the_header(kinematic_artef
         assert list(elements.values()) == [f"BR_{prefix}{one}" for one in names]
         first = 251 if name == "br_no_step" else 0
         assert list(elements) == list(range(first, first + len(elements)))
+    assert list(of_steps.values()) == list(range(len(of_steps)))
     assert list(no_steps.values()) == list(range(251, 256))
     duty = dict(artefact.ffi.typeof("br_braking").fields)["duty"].type
     numbers = duty.length, artefact.library.BR_SAMPLES, artefact.library.BR_WATCHED

@@ -11,17 +11,13 @@ import pytest
 from bayesrace.arrays import Floats
 from bayesrace.controller.assembly import PredictiveController
 from bayesrace.controller.driver import (
-    HALTED,
-    NO_STATE,
-    STEP_FAILED,
-    UNPREDICTABLE,
     Decision,
     Driver,
     Level,
     Phase,
 )
 from bayesrace.controller.interface import Environment, StepOutput
-from bayesrace.controller.native_step import NativeStep, StepStatus
+from bayesrace.controller.native_step import NativeStep, Status
 from bayesrace.controller.process_settings import ControllerSettings
 from bayesrace.controller.settings import CompensationSettings
 from bayesrace.messages import State
@@ -112,7 +108,7 @@ def test_silence_goes_down_all_levels_and_ends_at_standstill(rig: Rig) -> None:
     driving(rig)
     bridged = [rig.silent_cycle().level for _ in range(3)]
     statuses = [rig.silent_cycle().status for _ in range(200)]
-    assert set(statuses) == {NO_STATE}
+    assert set(statuses) == {Status.NO_STATE}
     counts = rig.driver.levels
     assert bridged == [Level.SOLUTION] * 3
     assert counts[Level.SHIFTED_PLAN] >= 2
@@ -135,11 +131,11 @@ def test_states_that_come_back_drive_again_after_several_good_solutions(rig: Rig
     ("delay_s", "index", "number", "status"),
     [
         # Steered farther than a period at full rate can bring back within the limit.
-        (0.0, 6, 0.6, StepStatus.INFEASIBLE),
-        (0.0, 4, np.nan, StepStatus.BAD_STATE),
+        (0.0, 6, 0.6, Status.INFEASIBLE),
+        (0.0, 4, np.nan, Status.BAD_STATE),
         # With a delay to predict over, the model is asked before the step is.
-        (0.02, 4, np.nan, UNPREDICTABLE),
-        (0.02, 4, 1e5, UNPREDICTABLE),
+        (0.02, 4, np.nan, Status.UNPREDICTABLE),
+        (0.02, 4, 1e5, Status.UNPREDICTABLE),
     ],
 )
 def test_a_state_without_a_solution_is_answered_by_the_plan_before(
@@ -164,7 +160,7 @@ def test_a_budget_too_small_for_a_plan_steps_down(rig: Rig, native: NativeStep) 
     strict = SETTINGS.model_copy(update={"defect_max": 1e-9})
     native.set_parameters(get_car(native.manifest.car), strict)
     decision = rig.cycle(budget_s=1e-9)
-    assert decision.status == StepStatus.TIME_LIMIT
+    assert decision.status == Status.TIME_LIMIT
     assert decision.level is Level.BRAKE
 
 
@@ -187,7 +183,7 @@ def test_a_step_that_raises_is_counted_and_stepped_down_from(kinematic_artefact:
     law.answer = None
     driver.observe(state(3))
     decision = driver.decide(3 * STEP_S)
-    assert (decision.status, decision.level) == (STEP_FAILED, Level.SHIFTED_PLAN)
+    assert (decision.status, decision.level) == (Status.STEP_FAILED, Level.SHIFTED_PLAN)
     assert (driver.count("failed"), driver.output) == (1, None)
     assert driver.last_error == "RuntimeError: no step today"
 
@@ -196,12 +192,12 @@ def test_stop_and_go(rig: Rig) -> None:
     driving(rig)
     rig.driver.stop()
     slowing = 0
-    while rig.cycle().status != HALTED:
+    while rig.cycle().status != Status.HALTED:
         assert rig.driver.phase is Phase.STOPPED
         slowing += 1
         assert slowing < 200
     for _ in range(20):
-        assert rig.cycle().status == HALTED
+        assert rig.cycle().status == Status.HALTED
     assert abs(rig.x[3]) < 0.05
     assert rig.driver.levels == [20 + slowing, 0, 0, 0]  # a stop on command is no fallback
     rig.driver.go()
@@ -215,7 +211,7 @@ def test_a_stopped_car_stays_stopped_in_the_next_run(rig: Rig, change: dict[str,
     """Plant time begins anew there: by the old one the speed allowed would be beyond all bounds."""
     driving(rig, 60)
     rig.driver.stop()
-    while rig.cycle().status != HALTED:
+    while rig.cycle().status != Status.HALTED:
         pass
     rig.driver.lost(silent=False)
     rig.seq, rig.epoch = 0, change.get("epoch", 1)
@@ -224,7 +220,7 @@ def test_a_stopped_car_stays_stopped_in_the_next_run(rig: Rig, change: dict[str,
         decision = rig.cycle(
             run=change.get("run", 1), time_s=0.02 * rig.seq - 20 * (rig.epoch == 1)
         )
-        assert decision.status == HALTED
+        assert decision.status == Status.HALTED
         assert abs(decision.d) < 0.02
     assert rig.driver.phase is Phase.STOPPED
 
@@ -234,7 +230,7 @@ def test_a_rolling_car_taken_over_on_hold_slows_down_along_the_line(
 ) -> None:
     rig = Rig(native, circuit, hold=True)
     count = 0
-    while rig.cycle().status != HALTED:
+    while rig.cycle().status != Status.HALTED:
         count += 1
         assert count < 200
     assert count > 10
@@ -246,7 +242,7 @@ def test_on_hold_it_stands_until_go(native: NativeStep, circuit: Circuit) -> Non
     rig = Rig(native, circuit, hold=True)
     rig.x[3] = 0.0
     for _ in range(10):
-        assert rig.cycle().status == HALTED
+        assert rig.cycle().status == Status.HALTED
     assert rig.driver.phase is Phase.READY
     assert abs(rig.x[3]) < 1e-3
     rig.driver.go()
@@ -285,7 +281,7 @@ def test_whatever_a_law_in_python_does_ends_in_the_fallback(
     )
     driver.observe(state(0))
     decision = driver.decide(0.0)
-    assert decision.status == (UNPREDICTABLE if "predict" in broken else STEP_FAILED)
+    assert decision.status == (Status.UNPREDICTABLE if "predict" in broken else Status.STEP_FAILED)
     assert decision.level is Level.STOP
     assert text in driver.controller.last_error
 
@@ -318,7 +314,7 @@ def test_two_cycles_of_one_controller_tell_their_own_results(
 def test_a_refused_step_has_a_reason(native: NativeStep, circuit: Circuit) -> None:
     rig = Rig(native, circuit)
     rig.environment = Environment(speed_limit_mps=-1.0)
-    assert rig.cycle().status == STEP_FAILED
+    assert rig.cycle().status == Status.STEP_FAILED
     assert rig.driver.last_error == "a parameter is not finite or out of its range"
 
 

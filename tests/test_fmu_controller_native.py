@@ -12,8 +12,8 @@ from bayesrace.codegen import host_files
 from bayesrace.codegen.build import HOST
 from bayesrace.codegen.build import NATIVE as HEADERS
 from bayesrace.codegen.host_files import PATH_FILE, WEIGHTS_FILE, path_file, weights_file
-from bayesrace.controller import assembly, driver, native_step
-from bayesrace.controller.native_step import StepStatus
+from bayesrace.controller import assembly, native_step
+from bayesrace.controller.native_step import Status
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import Weights
 from bayesrace.manifest import read_manifest
@@ -40,9 +40,9 @@ def test_sizes_and_limits_of_the_native_step_are_those_that_python_states(
 def test_statuses_mean_what_they_mean_in_the_controller_process(exported: Exported) -> None:
     [status] = [one for one in exported.define().variables if one.name == "status"]
     numbers = [int(number) for number in re.findall(r"\d+", status.description)]
-    of_steps = [one for one in StepStatus if one is not StepStatus.TIME_LIMIT]  # has no budget
-    without = [driver.DOUBTED, driver.UNPREDICTABLE, driver.HALTED, driver.NO_STATE]
-    assert numbers == [*of_steps, *without, driver.STEP_FAILED]
+    of_steps = [one for one in Status if one < Status.TIME_LIMIT]  # has no budget
+    without = [Status.DOUBTED, Status.UNPREDICTABLE, Status.HALTED, Status.NO_STATE]
+    assert numbers == [*of_steps, *without, Status.STEP_FAILED]
 
 
 @pytest.fixture(scope="module")

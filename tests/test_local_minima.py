@@ -7,7 +7,7 @@ import pytest
 from rich.console import Console
 
 from bayesrace.controller.assembly import compiled_controller
-from bayesrace.controller.native_step import StepStatus
+from bayesrace.controller.native_step import Status
 from bayesrace.operation.closed_loop import ClosedLoop, Driven
 from bayesrace.operation.preparation import prepare, updated_weights
 from bayesrace.operation.settings import PreparationSettings
@@ -53,4 +53,4 @@ def test_from_rest_a_plan_is_found_anywhere_on_the_line(track: str) -> None:
             native.reset()
             pose = (line.x_m[k], line.y_m[k], line.psi_rad[k])
             native.step(np.array([*pose, speed_mps, 0.0, 0.0, 0.0]), np.zeros(2))
-            assert StepStatus(native.info.status).usable, (k, speed_mps)
+            assert Status(native.info.status).usable, (k, speed_mps)

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bayesrace.controller.native_step import NativeStep, StepStatus
+from bayesrace.controller.native_step import NativeStep, Status
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import Weights
 from bayesrace.vehicles import Car
@@ -21,12 +21,12 @@ def test_an_absurd_state_or_duty_cycle_is_bad_state_and_leaves_the_input(
         numbers = np.r_[circuit.start(), 0.0]
         numbers[index] = value
         native.u[:] = 0.125
-        assert native.step(numbers[:7], numbers[7]) is StepStatus.BAD_STATE
+        assert native.step(numbers[:7], numbers[7]) is Status.BAD_STATE
         assert (native.u == 0.125).all()
         assert native.step(circuit.start(), 0.0).usable
 
 
-def broken_step(native: NativeStep, problem: Problem, how: str) -> StepStatus:
+def broken_step(native: NativeStep, problem: Problem, how: str) -> Status:
     x, reference = problem.x0.copy(), problem.reference.copy()
     if how == "steering":
         x[6] = 0.35 + 5 * 0.02 + 1e-3  # the rate cannot bring it back within a period
@@ -37,11 +37,11 @@ def broken_step(native: NativeStep, problem: Problem, how: str) -> StepStatus:
 
 @pytest.mark.parametrize(
     ("how", "expected"),
-    [("steering", StepStatus.INFEASIBLE), ("reference", StepStatus.NOT_FINITE)],
+    [("steering", Status.INFEASIBLE), ("reference", Status.NOT_FINITE)],
 )
 @pytest.mark.parametrize("warm", [False, True])
 def test_a_failed_step_says_why_keeps_the_input_and_leaves_no_trace(
-    make: Make, recorded: list[Problem], how: str, expected: StepStatus, warm: bool
+    make: Make, recorded: list[Problem], how: str, expected: Status, warm: bool
 ) -> None:
     native, fresh = make(), make()
     if warm:
@@ -72,7 +72,7 @@ def test_a_steering_angle_that_the_rate_can_bring_back_is_solved(
 def test_a_plan_off_the_dynamics_is_a_defect(make: Make, recorded: list[Problem]) -> None:
     step, p = make(defect_max=1e-13, iterations=1, iterations_cold=1), recorded[50]
     step.u[:] = 0.125
-    assert step.solve(p.x0, p.d_previous, p.reference) is StepStatus.DEFECT
+    assert step.solve(p.x0, p.d_previous, p.reference) is Status.DEFECT
     assert step.info.defect > 1e-13
     assert (step.u == 0.125).all()
 
@@ -84,7 +84,7 @@ def test_weights_that_overflow_are_not_finite_and_others_recover(
     huge = replace(vy, alpha=np.full(vy.count, 1e306), signal_variance=1e3)
     native.set_weights(replace(weights, outputs=(vx, huge, omega)))
     p = recorded[0]
-    assert native.solve(p.x0, p.d_previous, p.reference) is StepStatus.NOT_FINITE
+    assert native.solve(p.x0, p.d_previous, p.reference) is Status.NOT_FINITE
     native.set_weights(weights)
     assert native.solve(p.x0, p.d_previous, p.reference).usable
 

@@ -13,7 +13,7 @@ from bayesrace.codegen.build import problem_of
 from bayesrace.codegen.ocp import OcpNlp
 from bayesrace.codegen.settings import BuildSettings
 from bayesrace.controller.assembly import make_path_table
-from bayesrace.controller.native_step import NativeStep, StepStatus
+from bayesrace.controller.native_step import NativeStep, Status
 from bayesrace.controller.settings import MpcSettings
 from bayesrace.gp.expression import corrected_function
 from bayesrace.gp.weights import Weights
@@ -50,7 +50,7 @@ AT_BOUND = 1e-8
 E_KINEMATIC = BuildSettings()
 
 
-def solved(step: NativeStep, problem: Problem) -> tuple[StepStatus, Floats, Floats]:
+def solved(step: NativeStep, problem: Problem) -> tuple[Status, Floats, Floats]:
     """Status and plan of a solution from cold."""
     step.reset()
     status = step.solve(problem.x0, problem.d_previous, problem.reference)
@@ -87,7 +87,7 @@ def test_the_converged_step_is_the_solution_of_ipopt(
     kinds: dict[str, int] = {}
     for problem in recorded[::12]:
         status, x, u = solved(exact, problem)
-        assert status is StepStatus.CONVERGED
+        assert status is Status.CONVERGED
         oracle = ocp.solve(
             problem.x0, problem.d_previous, problem.reference, EXACT.parameters(car), (x, u)
         )
@@ -107,7 +107,7 @@ def test_nearly_every_problem_converges_from_cold(
     """Where the exact Hessian is indefinite, convergence is linear and may take too long."""
     statuses = [solved(exact, problem)[0] for problem in recorded]
     assert all(status.usable for status in statuses)
-    assert statuses.count(StepStatus.CONVERGED) >= 0.95 * len(statuses)
+    assert statuses.count(Status.CONVERGED) >= 0.95 * len(statuses)
 
 
 @pytest.mark.check
@@ -119,7 +119,7 @@ def test_the_cost_is_no_worse_than_that_of_ipopt_from_its_own_start(
     same = 0
     for problem in recorded[5::15]:
         status, _, u = solved(exact, problem)
-        if status is not StepStatus.CONVERGED:
+        if status is not Status.CONVERGED:
             continue  # their share is bounded below
         oracle = ocp.solve(problem.x0, problem.d_previous, problem.reference, EXACT.parameters(car))
         if not oracle.success or np.abs(oracle.u - u).max() > 0.05:
@@ -141,7 +141,7 @@ def test_the_converged_best_case_step_is_the_solution_of_ipopt(
     ocp = OcpNlp(problem_of(BuildSettings.best_case()), f, 20, options=TIGHT_IPOPT | FROM_OUR_PLAN)
     for problem in problems[::30]:
         status, x, u = solved(step, problem)
-        assert status is StepStatus.CONVERGED
+        assert status is Status.CONVERGED
         oracle = ocp.solve(
             problem.x0, problem.d_previous, problem.reference, EXACT.parameters(car), (x, u)
         )
@@ -236,7 +236,7 @@ def test_residuals_of_converged_plans_are_true(
     exact: NativeStep, corrected: ca.Function, recorded: list[Problem], car: Car
 ) -> None:
     for problem in recorded[3::25]:
-        assert solved(exact, problem)[0] is StepStatus.CONVERGED
+        assert solved(exact, problem)[0] is Status.CONVERGED
         assert check_residuals(exact, problem, corrected, EXACT, car) < 1e-8
         assert exact.info.bound < 1e-9
 
@@ -257,7 +257,7 @@ def test_residuals_of_real_time_steps_are_true(
         if native.info.shortened == 0:
             assert best <= np.sqrt(40) * native.info.stationarity * size + 1e-10
         converged = max(native.info.stationarity, native.info.defect) <= SETTINGS.tolerance
-        assert (status is StepStatus.CONVERGED) == converged
+        assert (status is Status.CONVERGED) == converged
 
 
 @pytest.mark.parametrize(

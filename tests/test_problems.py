@@ -26,7 +26,7 @@ from bayesrace.codegen.problems.problem import (
     linearised,
 )
 from bayesrace.codegen.settings import BuildSettings
-from bayesrace.controller.native_step import NativeProblem, StepStatus
+from bayesrace.controller.native_step import NativeProblem, Status
 from bayesrace.errors import InputError
 from bayesrace.integrators import Discretisation
 
@@ -193,7 +193,7 @@ def test_it_solves_to_the_solution_of_ipopt_along_a_flight(
         reference = stages(k)
         status = native.solve(x, u, reference)
         assert status.usable
-        converged += status is StepStatus.CONVERGED
+        converged += status is Status.CONVERGED
         plan_x, plan_u = (part.copy() for part in native.read_plan())
         oracle = ocp.solve(x, u, reference, VALUES, (plan_x, plan_u))
         assert oracle.success, oracle.status

@@ -12,7 +12,7 @@ from bayesrace.codegen.ocp import OcpNlp
 from bayesrace.codegen.settings import BuildSettings
 from bayesrace.controller.assembly import PathTable, make_path_table
 from bayesrace.controller.interface import NO_LIMITS, Environment
-from bayesrace.controller.native_step import NativeStep, StepStatus
+from bayesrace.controller.native_step import NativeStep, Status
 from bayesrace.controller.settings import MpcSettings
 from bayesrace.gp.expression import corrected_function
 from bayesrace.gp.weights import Weights
@@ -66,7 +66,7 @@ def test_the_converged_step_is_the_solution_of_ipopt(
             step.set_parameters(car, exact)
             status = step.solve(x, d, reference, elapsed_s=0.0)
             assert status.usable
-            if status is StepStatus.CONVERGED:
+            if status is Status.CONVERGED:
                 compared += 1
                 plan = step.read_plan()
                 oracle = ocp.solve(x, d, reference, values, plan)

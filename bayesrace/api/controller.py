@@ -1,25 +1,31 @@
 """The controller as an object with ``step``, for control loops of one's own."""
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from enum import IntEnum
 from pathlib import Path
 from time import perf_counter_ns
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydantic import ValidationError
 
-from bayesrace.api.values import Input, Range, State, car_of, number, track_of
+from bayesrace.api.values import (
+    Input,
+    Range,
+    State,
+    car_of,
+    finite_input,
+    number,
+    track_of,
+    validated,
+)
 from bayesrace.arrays import Floats
 from bayesrace.controller.assembly import PredictiveController, compiled_controller
 from bayesrace.controller.driver import Driver, Level
-from bayesrace.controller.native_step import NativeStep
+from bayesrace.controller.native_step import NativeStep, Status
 from bayesrace.controller.settings import CycleSettings, GateSettings, MpcSettings
 from bayesrace.controller.weights.checks import Checks, Samples
-from bayesrace.errors import InputError, faults_in
+from bayesrace.errors import InputError
 from bayesrace.gp.weights import Weights, encode_weights, read_weights
 from bayesrace.integrators import PERFECT, PREDICTION
 from bayesrace.messages import SENSOR_FAULTS
@@ -31,39 +37,7 @@ from bayesrace.vehicles import Car
 if TYPE_CHECKING:
     from bayesrace.codegen.problems.problem import Problem
 
-__all__ = ["Controller", "Status", "Step", "Times", "validated"]
-
-
-class Status(IntEnum):
-    """What became of a step's optimisation problem, or why there was none; 0 and 1 are driven. The
-    numbers are this project's, not those of other solvers."""
-
-    CONVERGED = 0
-    """Solved to the tolerance; of a :class:`Step` also what is acceptable."""
-    ACCEPTABLE = 1
-    """Not to the tolerance, but the plan follows the model and keeps the bounds."""
-    DEFECT = 2
-    """The plan does not follow the model."""
-    INFEASIBLE = 3
-    """A quadratic programme has no solution: hard bounds contradict each other."""
-    QP_LIMIT = 4
-    """A quadratic programme took too many iterations."""
-    NOT_FINITE = 5
-    """A number is not finite, as of a cost that is not convex in the states."""
-    BAD_STATE = 6
-    """The state, or the input before, is absurd."""
-    TIME_LIMIT = 7
-    """The time was up before there was a usable plan."""
-    DOUBTED = 251
-    """States contradict each other, for longer than they may be old."""
-    UNPREDICTABLE = 252
-    """The state could not be predicted to the moment of acting."""
-    HALTED = 253
-    """The car is not to be driven."""
-    NO_STATE = 254
-    """The newest one is too old."""
-    STEP_FAILED = 255
-    """The step itself is broken."""
+__all__ = ["Controller", "Step", "Times"]
 
 
 @dataclass(slots=True)
@@ -88,7 +62,8 @@ class Step:
     plan_u: Floats
     """Planned inputs, shape (N, 2) or (0, 2)."""
     tube: Floats
-    """Standard deviation of the car's place across the plan at stages 1 to N [m], shape (N,)."""
+    """How far the car may be off to either side at stages 1 to N [m], at the probability of the
+    setting ``caution``, shape (N,) or (0,)."""
     status: Status
     """What became of the optimisation problem."""
     level: Level
@@ -102,6 +77,7 @@ class Step:
 
 _NO_PLAN: Final = np.zeros((0, 7)), np.zeros((0, 2)), np.zeros(0)
 _STATUS: Final = {int(one): one for one in Status}
+"""Found faster than by the enum itself."""
 
 
 class Controller:
@@ -140,7 +116,7 @@ class Controller:
           ``bayesrace controller --settings`` (``controller/settings.py``).
         - ``parameters``: values of what a problem of your own has beyond the settings.
         - ``delay_s``: from a state to the moment at which its input acts, where that is known and
-          constant; None: as :meth:`step` is told.
+          constant; None: what :meth:`step` is given counts.
 
         InputError names what does not fit together.
         """
@@ -167,14 +143,14 @@ class Controller:
             wanted["problem"] = problem
         else:
             _check_problem(own, car, model)
-        tuned = validated(MpcSettings, dict(settings or {}))
+        self._settings: MpcSettings = validated(MpcSettings, dict(settings or {}))
         self.artefact, _ = build(validated(BuildSettings, wanted), problem=own)
         """Folder of the compiled controller, as ``bayesrace build`` names it."""
         self._predictive: PredictiveController = compiled_controller(
-            self.artefact, car, track, self.line, None, tuned, parameters=parameters
+            self.artefact, car, track, self.line, None, self._settings, parameters=parameters
         )
         self._parameters = dict(parameters or {})
-        compensation = {} if delay_s is None else {"mode": "fixed", "delay_s": delay_s}
+        compensation = None if delay_s is None else {"mode": "fixed", "delay_s": delay_s}
         self._cycle_settings = validated(CycleSettings, {"compensation": compensation})
         self._driver = Driver(self._predictive, car, self._cycle_settings)
         self._range = Range(car, track)
@@ -260,7 +236,7 @@ class Controller:
         InputError for a state, an input or a time that cannot be; nothing has happened then.
         """
         x = None if state is None else self._range.checked(state)
-        applied = self._u if u_applied is None else _finite(u_applied)
+        applied = self._u if u_applied is None else finite_input(u_applied, "u_applied")
         if delay_s is not None:
             number(delay_s, "delay_s", 0.0, 1.0, "seconds, at most 1")
         time_s = self._clock(self.step_s if dt is None else dt)
@@ -290,11 +266,6 @@ class Controller:
             SENSOR_FAULTS[decision.fault],
             Times(decision.step_us, self.prepare() if prepare else 0.0),
         )  # fmt: skip
-
-    def checked(self, state: State | ArrayLike) -> tuple[float, ...]:
-        """The seven numbers of a state; InputError for what none of this car on this track can
-        be."""
-        return self._range.checked(state)
 
     def prepare(self) -> float:
         """Prepares the next step, for a state that comes an interval after the last; how long it
@@ -333,23 +304,6 @@ def _check_problem(problem: "Problem", car: Car, model: str) -> None:
             f"over {stage.step_s:g} s: make it of bayesrace.ocp.{model}(car) and "
             f"{'PERFECT' if model == 'dynamic' else 'PREDICTION'}"
         )
-
-
-def _finite(u: Input | ArrayLike) -> tuple[float, ...]:
-    """The two numbers of an input."""
-    d, delta_rate = Input.of(u)
-    if not (math.isfinite(d) and math.isfinite(delta_rate)):
-        raise InputError(f"u_applied = {d, delta_rate}: give finite numbers")
-    return d, delta_rate
-
-
-def validated(form: Any, values: dict[str, Any], names: Mapping[str, str] | None = None) -> Any:
-    """Settings of this form; InputError names what is wrong with the values. ``names``: of fields
-    that the caller knows by others."""
-    try:
-        return form.model_validate({k: v for k, v in values.items() if v is not None and v != {}})
-    except ValidationError as error:
-        raise InputError(faults_in(error, "the settings", form, names=names)) from None
 
 
 def _check_direction(line: RaceLine, track: Track) -> None:

@@ -9,11 +9,10 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from bayesrace.api.controller import Status, validated
-from bayesrace.api.values import number, numbers
+from bayesrace.api.values import number, numbers, validated
 from bayesrace.arrays import Floats
 from bayesrace.codegen.problems.problem import Problem
-from bayesrace.controller.native_step import NativeProblem
+from bayesrace.controller.native_step import NativeProblem, Status
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import pack_outputs
 from bayesrace.integrators import Discretisation
@@ -51,7 +50,7 @@ class Solution:
     @property
     def usable(self) -> bool:
         """Whether the input may be applied: solved to the tolerance, or acceptable."""
-        return self.status <= Status.ACCEPTABLE
+        return self.status.usable
 
 
 class Mpc:
@@ -103,9 +102,6 @@ class Mpc:
         """The compiled problem, for measurements."""
         if not isinstance(parameters, Mapping):
             raise InputError(f"parameters = {parameters!r:.60}: give values by name")
-        names = {one.name for one in problem.parameters}
-        if missing := sorted(names - set(parameters)):
-            raise InputError(f"parameters: {', '.join(missing)} of '{problem.name}' are missing")
         self.native.set_values(_SOLVER | dict(parameters) | dict(solver or {}))
         self._parameters = {name: float(value) for name, value in parameters.items()}
         self._shape = horizon, len(problem.stage_parameters)
@@ -185,7 +181,7 @@ class Mpc:
         plan, plan_u = self.native.read_plan()
         self._u = self.native.u.copy()
         return Solution(
-            self._u.copy(), plan.copy(), plan_u.copy(), Status(int(status)),
+            self._u.copy(), plan.copy(), plan_u.copy(), status,
             float(info.cost), int(info.iterations), solve_us,
         )  # fmt: skip
 

@@ -39,7 +39,8 @@ def run_figure(run: "Run") -> Figure:
     the way."""
     rows = _last_lap(run)
     x, u, track = run.x[rows], run.u[rows.start : rows.stop - 1], run.driven.track
-    s_m = np.unwrap(track.project_path(x[:, :2]).s_m, period=track.length_m)
+    on_track = run.driven.projected
+    s_m = np.unwrap(on_track.s_m[rows], period=track.length_m)
     with figure_style():
         figure = Figure(figsize=(PICTURE_WIDTH, 5.2), layout="constrained")
         grid = figure.add_gridspec(3, 2, width_ratios=(1.25, 1))
@@ -47,7 +48,7 @@ def run_figure(run: "Run") -> Figure:
         edges = track.boundaries(0.04)
         draw_edges(place, *edges)
         _draw_way(figure, place, x[:, :2], np.hypot(x[:, 3], x[:, 4]))
-        off = x[track.project_path(x[:, :2]).off_track_m > 0]
+        off = x[on_track.off_track_m[rows] > 0]
         if len(off):
             place.plot(off[:, 0], off[:, 1], "o", color=WARNING, markersize=3, label="off track")
             place.legend()

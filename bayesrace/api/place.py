@@ -9,12 +9,11 @@ import numpy as np
 
 from bayesrace.api.values import State
 from bayesrace.arrays import Floats
+from bayesrace.plant.car import LineCounter
 from bayesrace.tracks import StartLine, Track
 
 __all__ = ["Centreline", "LapTimer", "Place", "curvature_table"]
 
-_ONE_FOOT: Final = 0.8
-"""Of the least radius: nearer to the centreline than this, a place has one nearest point on it."""
 _NEWTON_STEPS: Final = 10
 _TABLE_STEP: Final = 1 / 64
 """Of the narrowest width: spacing of the table of curvatures."""
@@ -57,10 +56,7 @@ class Centreline:
         growth = (np.roll(widths, -1, axis=0) - widths) / step
         pieces = np.column_stack([point, first, second / 2, third / 6, widths, growth])
         self._pieces: list[tuple[float, ...]] = [tuple(one) for one in pieces.tolist()]
-        _, curvature = curvature_table(track, 0.0)
-        reach_m = float(np.max(widths.sum(axis=1)))
-        near_m = _ONE_FOOT / max(float(np.max(np.abs(curvature))), 1e-9)
-        self._near_m2 = min(near_m, reach_m) ** 2
+        self._near_m2 = min(track.one_foot_m, float(np.max(widths.sum(axis=1)))) ** 2
 
     def locate(self, x: float, y: float, before: Place | None = None) -> Place:
         """Place of a car at x, y [m]; before: its place a step ago, None: it may be anywhere."""
@@ -113,27 +109,19 @@ class LapTimer:
     """Times laps step by step, by the rule of :func:`.time_laps`."""
 
     def __init__(self, track: Track) -> None:
-        self._line = StartLine(track)
+        line = StartLine(track)
+        self._line = LineCounter(*track.start_pose(), line.left_m, line.right_m)
 
     def begin(self, state: State) -> None:
         """At time zero."""
-        self._at = state.x, state.y
-        self._past = bool(self._line.is_past(*self._at))
-        self._crossings = 0
+        self._line.restart(state.x, state.y)
         self._ends_s = [0.0]
         self.times_s: tuple[float, ...] = ()
         """Of the laps."""
 
     def move(self, state: State, time_s: float, step_s: float) -> None:
         """To the state at this time, a step after the one before."""
-        before, was_past = self._at, self._past
-        self._at = state.x, state.y
-        self._past = bool(self._line.is_past(*self._at))
-        if self._past == was_past:
-            return
-        crossing = self._line.crossing(before, self._at)
-        self._crossings += crossing.direction
-        if self._crossings > len(self.times_s):
+        if self._line.move(state.x, state.y) > len(self.times_s):
             before_s = time_s - step_s
-            self._ends_s.append(before_s + crossing.fraction * (time_s - before_s))
+            self._ends_s.append(before_s + self._line.newest.fraction * (time_s - before_s))
             self.times_s = tuple(end - begin for begin, end in pairwise(self._ends_s))

@@ -3,7 +3,7 @@
 from contextlib import ExitStack, closing
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,7 +14,7 @@ from bayesrace.api.values import State, number, optional
 from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
 from bayesrace.log import LogWriter
-from bayesrace.messages import SENSOR_FAULTS
+from bayesrace.messages import QUANTITIES, SENSOR_FAULTS
 from bayesrace.operation.analysis.laps import LapTimes
 from bayesrace.operation.closed_loop import ClosedLoop, Driven
 from bayesrace.raceline import RaceLine, same_track
@@ -26,8 +26,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 __all__ = ["Run", "drive", "ended"]
-
-_COLUMNS: Final = ("x", "y", "psi", "vx", "vy", "omega", "delta")
 
 
 def drive(
@@ -63,7 +61,7 @@ def drive(
         disturbed = {name: getattr(simulator, name) for name in disturbed}
     else:
         vehicle = OwnVehicle(simulator, car, track)
-    start = None if x0 is None else list(controller.checked(x0))
+    start = None if x0 is None else list(controller._range.checked(x0))
     about = {"drive": {"car": car_text(car), "track": track.name}}
     with ExitStack() as opened:
         opened.callback(controller.reset)
@@ -128,7 +126,7 @@ class Run:
         the end of the last lap that was asked for, or at all of a run that did not drive them."""
         if 0 < self.asked <= len(self.laps):
             return self.driven.off_track_m
-        return self.track.project_path(self.x[:, :2]).off_track_m
+        return self.driven.projected.off_track_m
 
     @property
     def off_track(self) -> int:
@@ -177,14 +175,14 @@ class Run:
         count, u = len(self.t), np.full((len(self.t), 2), np.nan)
         u[: len(self.u)] = self.u
         columns: dict[str, Any] = {"t": self.t}
-        columns |= dict(zip(_COLUMNS, self.x.T, strict=True))
+        columns |= dict(zip(QUANTITIES, self.x.T, strict=True))
         columns |= {"d": u[:, 0], "delta_rate": u[:, 1], "lap": self.driven.lap}
         for name in ("status", "level"):
             column = np.full(count, -1, dtype=np.int64)
             known = getattr(self, name)[:count]
             column[: len(known)] = known
             columns[name] = column
-        projected = self.driven.track.project_path(self.x[:, :2])
+        projected = self.driven.projected
         return columns | {"s_m": projected.s_m, "off_track_m": projected.off_track_m}
 
     def frame(self) -> Any:

@@ -8,7 +8,7 @@ from typing import Final, Protocol, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from bayesrace.api.values import Input, Range, State, car_of, number, track_of
+from bayesrace.api.values import Input, Range, State, car_of, finite_input, number, track_of
 from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
 from bayesrace.plant.settings import SimulatorName
@@ -131,9 +131,7 @@ class Simulator:
 
     def step(self, u: "Input | ArrayLike") -> State:
         """The state after one period with this input held; FmuFault if the car fails."""
-        d, delta_rate = given = tuple(Input.of(u))
-        if not (np.isfinite(d) and np.isfinite(delta_rate)):
-            raise InputError(f"u = {given}: give finite numbers, drive command and rad/s")
+        given = finite_input(u, "u")
         self._check_open()
         self.vehicle.step(given)
         return self.state
@@ -159,8 +157,6 @@ class Simulator:
 
 class OwnVehicle(Vehicle):
     """A simulator of one's own as what a run drives; its limits are its own matter."""
-
-    places_itself = True
 
     def __init__(self, own: OwnSimulator, car: Car, track: Track) -> None:
         """InputError for an object without ``reset`` and ``step``."""

@@ -4,9 +4,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from bayesrace.api.controller import Controller, validated
+from bayesrace.api.controller import Controller
 from bayesrace.api.runs import ended
-from bayesrace.controller.settings import MpcSettings
+from bayesrace.api.values import validated
 from bayesrace.errors import InputError
 from bayesrace.files import write_whole
 from bayesrace.gp.weights import Weights, write_weights
@@ -79,7 +79,7 @@ def drive_system(
     chosen = validated(RaceSettings, asked)
     limit_s = chosen.limit_s(driver.line.lap_time_s) if max_time_s is None else max_time_s
     plan = RunPlan(_RUN, "bayesrace", laps, limit_s, mode == "lockstep")
-    names, options = _written(folder, driver, settings or {})
+    names, options = _written(folder, driver)
     about = {"drive": {"car": car_text(driver.car), "track": driver.track.name}}
     with private_network() as network:
         names |= {one: getattr(network.network, one)[0] for one in SOURCES}
@@ -104,9 +104,7 @@ def drive_system(
     return SystemRun(folder, driven, ended(end.text, driven.laps), verdict, laps, statuses)
 
 
-def _written(
-    folder: Path, driver: Controller, settings: Mapping[str, Any]
-) -> tuple[dict[str, Any], list[str]]:
+def _written(folder: Path, driver: Controller) -> tuple[dict[str, Any], list[str]]:
     """What a controller process is started with, by name, and as options of the project's own."""
     files: dict[str, Any] = {
         "car": folder / "car.toml", "track": folder / "track.csv", "line": folder / "raceline.csv",
@@ -115,8 +113,7 @@ def _written(
     write_car(files["car"], driver.car)
     write_track(files["track"], driver.track)
     write_raceline(files["line"], driver.line)
-    tuned = validated(MpcSettings, dict(settings))
-    write_whole(files["settings"], tuned.model_dump_json(indent=1) + "\n")
+    write_whole(files["settings"], driver._settings.model_dump_json(indent=1) + "\n")
     if driver.weights is not None:
         files["weights"] = folder / "weights.bin"
         write_weights(files["weights"], driver.weights)

@@ -8,10 +8,9 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from bayesrace.api.controller import validated
 from bayesrace.api.logs import Log
 from bayesrace.api.runs import Run
-from bayesrace.api.values import car_of, number, numbers
+from bayesrace.api.values import car_of, number, numbers, validated
 from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import Weights

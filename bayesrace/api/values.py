@@ -1,21 +1,24 @@
 """States and inputs of a car as small objects with named fields, and what is refused as one."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import astuple, dataclass
 from importlib import import_module
+from math import isfinite
 from operator import le
 from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
+from pydantic import ValidationError
 
 from bayesrace.arrays import Floats
-from bayesrace.errors import InputError
+from bayesrace.errors import InputError, faults_in
 from bayesrace.tracks import Track, wide_enough
 from bayesrace.vehicles import Car
 
-__all__ = ["Input", "Range", "State", "car_of", "number", "numbers", "optional", "track_of"]
+__all__ = ["Input", "Range", "State", "car_of", "finite_input", "number", "numbers", "optional"]
+__all__ += ["track_of", "validated"]
 
 
 def numbers(values: ArrayLike, name: str) -> Floats:
@@ -31,6 +34,15 @@ def number(value: float, name: str, low: float, high: float, remedy: str) -> flo
     if isinstance(value, int | float | np.number) and low <= value <= high:
         return float(value)
     raise InputError(f"{name} = {value!r:.60}: give {remedy}")
+
+
+def validated(form: Any, values: dict[str, Any], names: Mapping[str, str] | None = None) -> Any:
+    """Settings of this form; InputError names what is wrong with the values. ``names``: of fields
+    that the caller knows by others."""
+    try:
+        return form.model_validate({k: v for k, v in values.items() if v is not None})
+    except ValidationError as error:
+        raise InputError(faults_in(error, "the settings", form, names=names)) from None
 
 
 def car_of(car: "Car | Path | str") -> Car:
@@ -112,6 +124,14 @@ class Input(_Numbers):
 
     def __iter__(self) -> Iterator[float]:
         return iter((self.d, self.delta_rate))
+
+
+def finite_input(values: ArrayLike, name: str) -> tuple[float, float]:
+    """The two numbers of an input; InputError, which names it, if one is not finite."""
+    u = Input.of(values)
+    if not (isfinite(u.d) and isfinite(u.delta_rate)):
+        raise InputError(f"{name} = {u.d, u.delta_rate}: give finite numbers")
+    return u.d, u.delta_rate
 
 
 class Range:

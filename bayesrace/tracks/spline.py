@@ -173,12 +173,13 @@ class CentrelineSearch:
         return self._samples[:, 0].tolist(), self._samples[:, 1].tolist()
 
     @cached_property
-    def _least_radius_m(self) -> float:
+    def one_foot_m(self) -> float:
+        """Nearer to the curve than this, a place has one nearest point on it."""
         s: Floats = np.arange(self._count, dtype=np.float64) * self._step
         _, first, second = self._curve.derivatives(s)
         cross = first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]
         curvature = np.abs(cross) / np.linalg.norm(first, axis=1) ** 3
-        return float(1 / np.max(curvature, initial=1e-9))
+        return _ONE_FOOT * float(1 / np.max(curvature, initial=1e-9))
 
     def nearest(self, points: Floats) -> Floats:
         """Arc lengths (m,) in [0, period) of the globally nearest curve points to (m, 2)."""
@@ -230,7 +231,7 @@ class CentrelineSearch:
         most = min(round(_BESIDE * reach / self._step), self._count // 2)
         around, found = np.arange(-most, most + 1), samples.copy()
         away_m = np.linalg.norm(points - self._samples[samples], axis=1)
-        sought = np.flatnonzero(away_m > _ONE_FOOT * self._least_radius_m)
+        sought = np.flatnonzero(away_m > self.one_foot_m)
         for part in (sought[i : i + _CHUNK] for i in range(0, len(sought), _CHUNK)):
             near = (samples[part, None] + around) % self._count
             square = np.sum((points[part, None] - self._samples[near]) ** 2, axis=2)

@@ -141,6 +141,11 @@ class Track:
         total = float(np.min(self.width_right_m + self.width_left_m))
         return CentrelineSearch(self.centreline, spacing_m=total / 16.0)
 
+    @property
+    def one_foot_m(self) -> float:
+        """A place that is nearer to the centreline than this has one nearest point on it."""
+        return self._search.one_foot_m
+
     @cached_property
     def _width_table(self) -> tuple[Floats, Floats, Floats]:
         right, left = self.width_right_m, self.width_left_m
