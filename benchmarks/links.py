@@ -94,8 +94,9 @@ def drive(case: Case) -> Driven:
     plant = PlantSettings(car=settings.car, buffer_s=1e-3 * case.buffer_ms)
     with TemporaryDirectory() as folder:
         log = LogWriter(Path(folder) / "run.mcap")
-        link = {"link": case.link, "seed": case.seed}
-        with SimulatedSystem(place.track, make, log, plant, **link) as system:
+        with SimulatedSystem(
+            place.track, make, log, plant, link=case.link, seed=case.seed
+        ) as system:
             system.drive(RunPlan(1, "bayesrace", _LAPS, _LIMIT_S, lockstep=False))
         log.close()
         driven = laps_in(Path(folder) / "run.mcap", 1, place.track)

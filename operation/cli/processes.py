@@ -74,8 +74,8 @@ def plant(
 
 @options_of(
     "bayesrace.controller.process_settings.ControllerSettings",
-    "car name rate_hz budget hold compensation sensor_tolerance realtime.cpu realtime.fifo "
-    "realtime.lock_memory",
+    "car name rate_hz budget hold compensation fallback.shifted_s sensor_tolerance "
+    "realtime.cpu realtime.fifo realtime.lock_memory",
 )
 def controller(
     network: "Configuration",
