@@ -63,14 +63,16 @@ class _CarClock:
 
     def __init__(self) -> None:
         self._run: tuple[int, int] | None = None
-        self._begin_ns = self._newest_ns = self._decided_ns = 0
+        self._begin_ns = self._newest_ns = 0
+        self._decided_ns: dict[str, int] = {}
 
-    def time_ns(self, message: Message | None, wall_ns: int) -> int:
+    def time_ns(self, message: Message | None, wall_ns: int, sender: str) -> int:
         """Of a state its own time, of actuation and telemetry that of the decision; of all else the
-        newest state's. ``wall_ns``: calendar time of its arrival."""
+        newest state's. ``wall_ns``: calendar time of its arrival; ``sender``: what the keys of a
+        controller, or of a shadow, have in common."""
         self._newest_ns = self._newest_ns or wall_ns
         if isinstance(message, Telemetry):  # follows its actuation, from the same process
-            return self._decided_ns or self._newest_ns
+            return self._decided_ns.get(sender, self._newest_ns)
         if not isinstance(message, State | Actuation):
             return self._newest_ns
         run = message.epoch, message.run
@@ -79,8 +81,8 @@ class _CarClock:
         time_ns = self._begin_ns + own_ns
         goes_on = run == self._run and abs(time_ns - self._newest_ns) <= _LONGEST_GAP_NS
         if isinstance(message, Actuation):  # it can overtake the first state of a run
-            self._decided_ns = time_ns if goes_on else self._newest_ns
-            return self._decided_ns
+            self._decided_ns[sender] = time_ns if goes_on else self._newest_ns
+            return self._decided_ns[sender]
         if not goes_on:
             time_ns = self._newest_ns if message.lockstep else max(self._newest_ns, wall_ns)
             self._run, self._begin_ns = run, time_ns - own_ns
@@ -130,7 +132,7 @@ class LogWriter:
             schema = 0 if message is None else self._schema(type(message))
             self._channels[place] = self._writer.register_channel(key, encoding, schema)
         wall_ns = self._epoch_ns + received_ns
-        time_ns = self._clock.time_ns(message, wall_ns)
+        time_ns = self._clock.time_ns(message, wall_ns, key.rpartition("/")[0])
         seq = None if message is None else message.seq
         content = data if message is None else to_json(message)
         number = 0 if seq is None else seq & 0xFFFFFFFF
