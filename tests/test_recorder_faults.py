@@ -26,7 +26,8 @@ def test_a_full_disk_does_not_end_a_drive(
 ) -> None:
     log = tmp_path / "drive.mcap"
     drive = start(
-        "drive", *waiting.track, "--laps", "1000", "--max-time", "20", *options, *waiting.where, "--log", log,
+        "drive", *waiting.track, "--laps", "1000", "--max-time", "20", *options,
+        *waiting.where, "--log", log,
         preexec_fn=limited,
     )  # fmt: skip
     waiting.ended.append(drive)
