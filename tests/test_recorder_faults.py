@@ -12,7 +12,7 @@ from tests.test_drive_command import Waiting, course, ended, waiting
 
 __all__ = ["course", "ended", "waiting"]
 
-FULL = 100_000
+FULL = 600_000
 
 
 def limited() -> None:
