@@ -17,6 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from bayesrace.defaults import CONFIGURATION_VARIABLE
 from bayesrace.errors import InputError, faults_in
 from bayesrace.files import parse_toml, read_text
+from bayesrace.log_parts import LogSize
 from bayesrace.messages import Role
 from bayesrace.realtime import RealtimeSettings
 from bayesrace.transport.credentials import CERTIFICATE, COVERS, MEMBERS, Credentials
@@ -140,6 +141,11 @@ class DriveSettings(_Section):
     hold_to_run: bool = Field(
         False,
         description="dead man's switch: 'drive' holds its runs, the plant refuses those of others",
+    )
+    max_log: LogSize | None = Field(
+        None,
+        description="size of the log that 'drive' writes at most, as \"500MB\": it goes on in new "
+        "files, and the oldest are deleted; not set: no limit",
     )
 
 
