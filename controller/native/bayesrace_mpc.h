@@ -31,12 +31,14 @@
 extern "C" {
 #endif
 
-#define BR_SECOND_START_ITERATIONS 12 /* at most; most often it needs eight */
 /* A step without a plan tries up to BR_COLD_GUESSES guesses; each after the first gets at most
  * BR_SECOND_START_ITERATIONS. If none gives a usable plan, the problem is solved without its soft
  * rows, and from that result with them; each of the two gets as many again. */
-#define BR_COLD_GUESSES 4
-#define BR_QP_STEPS 200       /* of the active-set method in one QP, at most */
+enum {
+    BR_COLD_GUESSES = 4,
+    BR_SECOND_START_ITERATIONS = 12, /* at most; most often it needs eight */
+    BR_QP_STEPS = 200                /* of the active-set method in one QP, at most */
+};
 #define BR_NV (BR_NX + BR_NU) /* stage variables v = [x; u] */
 #define BR_PATH_COLUMNS 7     /* see br_mpc_set_path */
 #define BR_PATH_CAPACITY 8192 /* points of the path table */
@@ -296,8 +298,9 @@ BR_API void br_mpc_reset(br_mpc *mpc);
  * iterates until an early stop (early_stop_tol 0: until converged) or as long as another iteration,
  * at the longest duration seen, fits, and returns the best usable plan. The first iteration is
  * always done. Without a clock or with budget_s <= 0 the iteration limits and qp_steps alone count,
- * so that the work of a step is bounded: docs/timing.md has the product. Either way an iteration that fails does not take back a usable plan found before it. After BR_TIME_LIMIT the
- * next step goes on from where this one stopped. */
+ * which bound the work of a step: docs/timing.md has the product. Either way an iteration that
+ * fails does not take back a usable plan found before it. After BR_TIME_LIMIT the next step goes on
+ * from where this one stopped. */
 BR_API br_mpc_error br_mpc_step(br_mpc *mpc, const double x[BR_NX], const double u_before[BR_NU],
                                 const br_environment *environment, double elapsed_s,
                                 double budget_s, double u[BR_NU], br_mpc_status *status,

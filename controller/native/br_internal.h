@@ -195,7 +195,7 @@ typedef struct {
     void *context;
     int limited; /* there is a deadline */
     double deadline;
-    int qp_steps; /* left */
+    int qp_steps;            /* left */
     double iteration, trial; /* longest seen, of the line search's trials too; 0: none yet */
     double caution;          /* what the last br_caution_update took */
 } br_timer;
