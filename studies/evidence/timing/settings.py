@@ -33,7 +33,7 @@ class TimingSettings(PreparationSettings):
     budget: float = Field(
         0.8, ge=0, le=1, description="share of the period that a cycle may take; 0: no limit"
     )
-    at_most_ms: float | None = Field(
+    at_most_ms: Annotated[float | None, Option("--at-most", metavar="MS")] = Field(
         None, gt=0, description="time that each phase may take [ms]; None: the period"
     )
     exceedance: float = Field(
