@@ -74,6 +74,10 @@ MEASUREMENTS: Final = {
         "bayesrace latency --rate 500 --json {out}/latency.json", "latency.json",
         (*_STEP, "controller", "plant"),
     ),
+    "timing": Measurement("bayesrace timing --at-most 1000 --out {out}", "timing.json", _STEP),
+    "timing40": Measurement(
+        "bayesrace timing --horizon 40 --at-most 1000 --out {out}", "timing.json", _STEP
+    ),
     "interface": Measurement(
         "python -m benchmarks.interface --json {out}/interface.json", "interface.json",
         (*_STEP, "controller", "plant", "operation/closed_loop.py", "benchmarks/interface.py"),

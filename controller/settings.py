@@ -20,7 +20,10 @@ SAMPLES: Final = 512
 WATCHED: Final = 100
 """BR_WATCHED there: the newest of these, on which weights are compared while they are watched."""
 
-_SOLVER: Final = ("tolerance", "defect_max", "early_stop_tol", "iterations", "iterations_cold")
+_SOLVER: Final = (
+    "tolerance", "defect_max", "early_stop_tol", "iterations", "iterations_cold",
+    "qp_steps",
+)  # fmt: skip
 """BR_SOLVER_FIELDS in controller/native/bayesrace_mpc.h that have the names of settings."""
 
 
@@ -74,6 +77,13 @@ class MpcSettings(BaseModel):
         ge=1,
         le=1000,
         description="the same after a reset; with a time budget the larger limits every step",
+    )
+    qp_steps: int = Field(
+        4000,
+        ge=200,
+        le=1_000_000,
+        description="active-set steps that all QPs of a step may take together, and those of a "
+        "preparation: then the best plan so far counts, and the next step goes on from it",
     )
 
     @field_validator("caution")

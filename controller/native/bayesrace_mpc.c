@@ -77,7 +77,8 @@ static int valid(const br_mpc_parameters *p) {
     const double numbers[] = {p->tolerance, p->defect_max, p->early_stop_tol, p->caution_sigmas};
     return br_all_finite(numbers, sizeof numbers / sizeof numbers[0]) && p->tolerance > 0 &&
            p->defect_max > 0 && p->early_stop_tol >= 0 && p->caution_sigmas >= 0 &&
-           p->iterations >= 1 && p->iterations_cold >= 1 && br_valid_parameters(p);
+           p->iterations >= 1 && p->iterations_cold >= 1 && p->qp_steps >= BR_QP_STEPS &&
+           br_valid_parameters(p);
 }
 
 static void limit_speeds(br_mpc *mpc);
@@ -439,7 +440,7 @@ const char *br_mpc_status_text(br_mpc_status status) {
         [BR_QP_LIMIT] = "QP iteration limit",
         [BR_NOT_FINITE] = "not finite",
         [BR_BAD_STATE] = "bad state",
-        [BR_TIME_LIMIT] = "out of time before the plan was usable",
+        [BR_TIME_LIMIT] = "out of time or QP steps before the plan was usable",
     };
     return (unsigned)status < sizeof texts / sizeof texts[0] ? texts[status] : "unknown status";
 }

@@ -189,12 +189,13 @@ typedef struct {
     BR_ALIGNED double correlations[BR_GP_ROOT][BR_COLUMNS];
 } br_caution;
 
-/* Time within a call, by the host's clock. */
+/* Time within a call, by the host's clock, and steps of its QPs. */
 typedef struct {
     br_mpc_clock clock; /* NULL: none */
     void *context;
     int limited; /* there is a deadline */
     double deadline;
+    int qp_steps;            /* left */
     double iteration, trial; /* longest seen, of the line search's trials too; 0: none yet */
     double caution;          /* what the last br_caution_update took */
 } br_timer;
@@ -359,9 +360,10 @@ static inline double br_timer_now(const br_timer *timer) {
     return timer->clock ? timer->clock(timer->context) : 0;
 }
 
-/* Whether what takes that long fits; a clock that gives NaN never lets anything begin. */
+/* Whether what takes that long fits, and QPs may take steps yet; a clock that gives NaN never lets
+ * anything begin. */
 static inline int br_timer_allows(const br_timer *timer, double now, double duration) {
-    return !timer->limited || timer->deadline - now >= duration;
+    return timer->qp_steps > 0 && (!timer->limited || timer->deadline - now >= duration);
 }
 
 static inline void br_timer_note(const br_timer *timer, double begin, double *longest) {
