@@ -46,6 +46,7 @@ _TASKS: Final = {
     "Drive": "processes.plant processes.controller race.drive processes.status processes.stop "
     "processes.go processes.router processes.doctor configuration.config configuration.certs",
     "Learn while driving": "learning.learn learning.publish learning.rollback",
+    "Evidence": "evidence.replay",
     "Measure": "tracks.limit race.bench race.latency race.paper",
     "Many laps": "race.campaign race.campaign_report race.campaign_scheduler "
     "race.campaign_worker race.tune",
