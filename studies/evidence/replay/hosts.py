@@ -96,7 +96,7 @@ class _Replay:
             yield self._answer(cycle, decision, accepted)
             if after is None:
                 return
-            if _run(after) == _run(cycle):
+            if after.run == cycle.run:
                 self._use(after.sent.weights_version)
             if lockstep or after.how.prepared_s < 0:
                 self._driver.prepare(self._driver.interval_s)
@@ -137,10 +137,6 @@ class _Replay:
         return Answer(cycle, u, decision.status, int(decision.level), how, version, accepted)
 
 
-def _run(cycle: Cycle) -> tuple[int, int]:
-    return cycle.sent.epoch, cycle.sent.run
-
-
 # Hosts without Python ----------------------------------------------------------------------------
 
 
@@ -149,11 +145,9 @@ def _plain(run: Sequence[Cycle]) -> list[Cycle]:
     first = run[0]
 
     def simple(cycle: Cycle) -> bool:
+        told = bool(cycle.commands) or cycle.limit_mps is not None or not cycle.states
         same = cycle.sent.weights_version == first.sent.weights_version
-        return (
-            same and cycle.answered.lockstep and not cycle.commands and cycle.limit_mps is None
-            and len(cycle.states) > 0
-        )  # fmt: skip
+        return same and cycle.answered.lockstep and not told
 
     return list(itertools.takewhile(simple, run))
 
@@ -171,8 +165,12 @@ def _c_host(setup: Setup, run: Sequence[Cycle]) -> Iterator[Answer]:
         weights = setup.weights(run[0].sent.weights_version)
         export(folder, manifest, table.rows, table.spacing_m, values, weights)
         instruments: dict[str, int] = {}
-        own = [[one for one in cycle.states if _same_run(one, cycle)] for cycle in run]
-        lines = "".join(_line(one, instruments) for states in own for one in states)
+        lines = "".join(
+            _line(one, instruments)
+            for cycle in run
+            for one in cycle.states
+            if (one.epoch, one.run) == cycle.run
+        )
         done = subprocess.run(
             [program, folder], input=lines, capture_output=True, text=True, check=False
         )
@@ -182,10 +180,6 @@ def _c_host(setup: Setup, run: Sequence[Cycle]) -> Iterator[Answer]:
     for cycle in run:
         if row := found.get(cycle.sent.state_seq):
             yield Answer(cycle, (float(row[4]), float(row[5])), int(row[6]), int(row[7]))
-
-
-def _same_run(state: State, cycle: Cycle) -> bool:
-    return (state.epoch, state.run) == _run(cycle)
 
 
 def _c_program(artefact: Path, folder: Path) -> Path:

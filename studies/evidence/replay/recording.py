@@ -3,6 +3,7 @@
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from itertools import groupby
 from pathlib import Path
 from typing import Any, Final
 
@@ -29,6 +30,8 @@ __all__ = ["COMMANDS", "Cycle", "Life", "read_lives"]
 COMMANDS: Final = ("stop", "go", "hold_lost")
 """Kinds of the controller's events; the last one is a stop until another run."""
 
+_RESTARTED: Final = 50
+"""An event that acts on telemetry so far back is of a controller that has not sent any yet."""
 _LOST: Final = "messages before it are not in the log"
 
 
@@ -47,6 +50,11 @@ class Cycle:
     how: Telemetry
     unknown: str
     """Why the recording does not say all that it depends on; empty: it does."""
+
+    @property
+    def run(self) -> tuple[int, int]:
+        """The plant's epoch, and the number of its run."""
+        return _run(self.sent)
 
     def limits(self, vx_mps: float, slow_down_mps2: float) -> Environment | None:
         """As :meth:`bayesrace.controller.weights.adoption.Adoption.limits`."""
@@ -72,13 +80,8 @@ class Life:
 
     def runs(self) -> Iterator[list[Cycle]]:
         """Its cycles by run."""
-        begin = 0
-        for at in range(1, len(self.cycles) + 1):
-            if at == len(self.cycles) or _run(self.cycles[at].sent) != _run(
-                self.cycles[begin].sent
-            ):
-                yield self.cycles[begin:at]
-                begin = at
+        for _, run in groupby(self.cycles, lambda one: one.run):
+            yield list(run)
 
 
 def _run(message: State | Actuation) -> tuple[int, int]:
@@ -96,14 +99,16 @@ def read_lives(path: Path) -> list[Life]:
     states: list[State] = []
     numbers: dict[type[Message], int] = {Actuation: -1, Telemetry: -1}
     of = dict.fromkeys(numbers, 0)
-    events: list[tuple[int, Event]] = []
+    events: list[tuple[int, Event]] = []  # with the number of the life
     reader = LogReader(path)
     for entry in reader.messages((STATE, ACTUATION, TELEMETRY, EVENT)):
         message = entry.message
         if isinstance(message, State):
             states.append(message)
         elif isinstance(message, Event):
-            events.append((of[Telemetry], message))
+            number = message.data.get("telemetry_seq")
+            of_next = isinstance(number, int) and number < numbers[Telemetry] - _RESTARTED
+            events.append((of[Telemetry] + of_next, message))
             if message.kind == RUN_EVENT and (plan := PlannedRun.of_event(message.data)):
                 named[plan.run] = plan.controller
         else:
@@ -113,12 +118,10 @@ def read_lives(path: Path) -> list[Life]:
             lives += [_Messages() for _ in range(of[kind] + 1 - len(lives))]
             lives[of[kind]].numbered[kind][message.seq] = message
     for number, event in events:
-        # What is reported between two lives is of the first, but for a stop before any cycle.
         if event.source == "controller" and number < len(lives):
             lives[number].events.append(event)
     places = {(one.epoch, one.run, one.seq): at for at, one in enumerate(states)}
-    whole = not (reader.refused or reader.truncated)
-    made = [one.life(states, places, named, whole) for one in lives]
+    made = [one.life(states, places, named) for one in lives]
     if not any(one.cycles for one in made):
         why = f": {reader.last_reason}" if reader.refused else ""
         raise InputError(f"{path} holds no cycle of a controller{why}; give the log of a drive")
@@ -137,7 +140,6 @@ class _Messages:
         states: Sequence[State],
         places: dict[tuple[int, int, int], int],
         named: dict[int, str],
-        whole: bool,
     ) -> Life:
         """Its cycles; ``places``: where in ``states`` each is."""
         life, next_at, before, unknown = Life(), 0, None, ""
@@ -150,10 +152,9 @@ class _Messages:
             if not life.cycles:
                 life.controller = named.get(sent.run, "")
                 next_at = next(i for i in range(at + 1) if _run(states[i]) == _run(answered))
-            new_run = before is None or _run(before.sent) != _run(sent)
             count = how.states if how.states >= 0 else max(at + 1 - next_at, 0)
             taken = states[max(at + 1 - count, 0) : at + 1]
-            if new_run:
+            if before is None or before.run != _run(sent):
                 unknown = self._beginning(before, taken, how)
             lost = before is not None and seq != before.how.seq + 1
             if lost or len(taken) < count:
