@@ -39,6 +39,8 @@ class Timing:
     wake_us: float = 0.0
     decode_us: float = 0.0
     prepare_us: float = 0.0
+    prepared_s: float = 0.0
+    prepared_refused: tuple[int, ...] = ()
     solve_us: float = 0.0
     encode_us: float = 0.0
     ticks: int = 0
@@ -66,6 +68,7 @@ class Cycle:
         self.driver = Driver(controller, car, settings)
         self.timing = Timing()
         self._controller = controller
+        self._reported = 0
 
     def answer(
         self,
@@ -95,7 +98,10 @@ class Cycle:
         """:meth:`Driver.prepare`, timed."""
         begin_ns = clock.perf_counter_ns()
         self.driver.prepare(period_s, budget_s)
-        self.timing.prepare_us = (clock.perf_counter_ns() - begin_ns) * 1e-3
+        timing = self.timing
+        timing.prepare_us = (clock.perf_counter_ns() - begin_ns) * 1e-3
+        timing.prepared_s = period_s
+        timing.prepared_refused = self.driver.refusals if budget_s > 0 else ()
 
     def actuation(self, seq: int, state: State, decision: Decision) -> Actuation:
         """The message that answers ``state``."""
@@ -118,6 +124,9 @@ class Cycle:
         timing.received_ns = received_ns
         output = self.driver.output or _NO_OUTPUT
         estimate, deviation = self._estimate()
+        states, self._reported = self.driver.taken - self._reported, self.driver.taken
+        prepared_s, prepared_refused = timing.prepared_s, timing.prepared_refused
+        timing.prepared_s, timing.prepared_refused = 0.0, ()
         numbers = {"cost": output.cost, "cost_shifted": output.cost_shifted, **output.numbers}
         return Telemetry(
             seq=seq,
@@ -143,6 +152,11 @@ class Cycle:
             second_start=output.second_start,
             estimate=estimate,
             deviation=deviation,
+            states=states,
+            late_s=max(decision.late_s, 0.0),
+            refused=decision.refused,
+            prepared_s=prepared_s,
+            prepared_refused=prepared_refused,
             **{name: _known(numbers.get(name, none), none) for name, none in NOT_REPORTED.items()},
         )
 

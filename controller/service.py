@@ -112,7 +112,7 @@ class Service:
             self._let_go = True
             self._holds_lost += 1
             self._text = f"stopped: {HOLD_MISSING}"
-            self.announce("hold_lost", self._text, {})
+            self.announce("hold_lost", self._text, self._next_cycle)
 
     @property
     def _drives(self) -> bool:
@@ -191,8 +191,13 @@ class Service:
         else:
             self._driver.go()
             self._text = f"driving on request: {command.text}"
-        self.announce(command.command, self._text, request.by)
+        self.announce(command.command, self._text, request.by | self._next_cycle)
         request.reply(True, self._text)
+
+    @property
+    def _next_cycle(self) -> dict[str, Scalar]:
+        """Data of an event: the ``seq`` of the first telemetry that it acts on."""
+        return {"telemetry_seq": self._counters()["ticks"]}
 
     def announce(self, kind: str, text: str, data: Mapping[str, Scalar]) -> None:
         """Publishes an event; from any thread."""

@@ -330,3 +330,31 @@ def test_steps_that_do_not_reach_the_limit_do_not_know_of_it(
         assert free.u.tobytes() == limited.u.tobytes()
     with pytest.raises(InputError, match="out of its range"):
         limited.set_values({"qp_steps": 199})
+
+
+# --- repeated by another clock ---
+
+
+def test_another_step_is_out_of_time_where_one_was(make: Make, recorded: list[Problem]) -> None:
+    """Whatever its clock says: so real-time drives are replayed to the bit."""
+    one, two = make(defect_max=1e-7), make(defect_max=1e-7)
+    hurried, patient = Clock(one, 1e-3), Clock(two, 0.0)
+    refused = one.artefact.ffi.new("int[]", one.artefact.library.BR_REFUSALS)
+    seen = set()
+    for at in range(50, 70):
+        p = recorded[at]
+        for step in (one, two):
+            solve(step, p, elapsed_s=0.02, budget_s=9.0 if step is two else 0.002 * (at % 9 + 1))
+            assert step.info.time_limited == one.info.time_limited
+            seen.add(step.info.time_limited)
+            count = step._library.br_mpc_get_refusals(step.handle, refused)
+            if step is one:
+                two._library.br_mpc_repeat(two.handle, refused, count)
+        assert (one.u == two.u).all()
+        for step, budget_s in ((one, 0.002 * (at % 7 + 1)), (two, 9.0)):
+            step.prepare(0.02, budget_s)
+            if step is one:
+                count = one._library.br_mpc_get_refusals(one.handle, refused)
+                two._library.br_mpc_repeat(two.handle, refused, count)
+    assert seen == {0, 1}
+    assert hurried.now_s > patient.now_s == 0.0

@@ -123,6 +123,21 @@ br_mpc_error br_mpc_set_clock(br_mpc *mpc, br_mpc_clock clock, void *context) {
     return BR_OK;
 }
 
+int br_mpc_get_refusals(const br_mpc *mpc, int refused[BR_REFUSALS]) {
+    if (!mpc || !refused) return 0;
+    memcpy(refused, mpc->timer.refused, sizeof mpc->timer.refused);
+    return mpc->timer.refusals;
+}
+
+br_mpc_error br_mpc_repeat(br_mpc *mpc, const int *refused, int count) {
+    if (!mpc || (!refused && count)) return BR_ERROR_NULL;
+    if (count < 0 || count > BR_REFUSALS) return BR_ERROR_PARAMETERS;
+    mpc->timer.given = count;
+    for (int i = 0; i < count; ++i) mpc->timer.refuse[i] = refused[i];
+    mpc->timer.told = 1;
+    return BR_OK;
+}
+
 void br_mpc_reset(br_mpc *mpc) {
     if (!mpc) return;
     mpc->warm = 0;

@@ -266,6 +266,16 @@ BR_API br_mpc_error br_mpc_get_samples(const br_mpc *mpc, double features[BR_SAM
  * from within br_mpc_step, br_mpc_solve and br_mpc_prepare only, in their thread. */
 BR_API br_mpc_error br_mpc_set_clock(br_mpc *mpc, br_mpc_clock clock, void *context);
 
+/* Where time ran out, for replaying what was driven in real time. A call with a budget asks its
+ * clock several times whether what comes next still fits. The refusals, the numbers of the
+ * questions (from 0 on) that were answered no, are all that a clock changes: another call with the
+ * same arguments and refusals gives the same result to the bit. br_mpc_get_refusals returns how
+ * many there were in the newest br_mpc_step, br_mpc_solve or br_mpc_prepare, the first BR_REFUSALS
+ * counted; br_mpc_repeat has the next call with a budget refuse these in place of the clock. */
+enum { BR_REFUSALS = 16 };
+BR_API int br_mpc_get_refusals(const br_mpc *mpc, int refused[BR_REFUSALS]);
+BR_API br_mpc_error br_mpc_repeat(br_mpc *mpc, const int *refused, int count);
+
 /* A clock for hosts that have none of their own: the system's monotonic one. context is unused.
  * Alone in br_clock.c, which a system without it leaves out. */
 BR_API double br_mpc_monotonic(void *context);

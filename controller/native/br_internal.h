@@ -198,6 +198,9 @@ typedef struct {
     int qp_steps;            /* left */
     double iteration, trial; /* longest seen, of the line search's trials too; 0: none yet */
     double caution;          /* what the last br_caution_update took */
+    int checks, refusals, refused[BR_REFUSALS]; /* of the newest call: see br_mpc_get_refusals */
+    int told, repeats;                          /* br_mpc_repeat was called; it counts now */
+    int given, refuse[BR_REFUSALS];
 } br_timer;
 
 /* What is computed from the plan, the weights and a call's arguments, and kept while these stay.
@@ -362,8 +365,17 @@ static inline double br_timer_now(const br_timer *timer) {
 
 /* Whether what takes that long fits, and QPs may take steps yet; a clock that gives NaN never lets
  * anything begin. */
-static inline int br_timer_allows(const br_timer *timer, double now, double duration) {
-    return timer->qp_steps > 0 && (!timer->limited || timer->deadline - now >= duration);
+static inline int br_timer_allows(br_timer *timer, double now, double duration) {
+    if (timer->qp_steps <= 0) return 0;
+    if (!timer->limited) return 1;
+    const int number = timer->checks++;
+    int allows = timer->deadline - now >= duration;
+    if (timer->repeats) {
+        allows = 1;
+        for (int i = 0; i < timer->given; ++i) allows &= timer->refuse[i] != number;
+    }
+    if (!allows && timer->refusals < BR_REFUSALS) timer->refused[timer->refusals++] = number;
+    return allows;
 }
 
 static inline void br_timer_note(const br_timer *timer, double begin, double *longest) {

@@ -13,6 +13,9 @@ static void start_timer(br_mpc *mpc, double budget) {
     timer->qp_steps = mpc->parameters.qp_steps;
     timer->limited = timer->clock && budget > 0;
     timer->deadline = timer->limited ? br_timer_now(timer) + budget : 0;
+    timer->checks = timer->refusals = 0;
+    timer->repeats = timer->limited && timer->told;
+    timer->told &= !timer->limited;
 }
 
 /* --- the plan in step with time --- */
@@ -426,7 +429,7 @@ static void foresee(br_mpc *mpc, double elapsed, int shifts) {
 
 /* Iterations at the problem at hand, towards tolerance. Returns whether there may be time left. */
 static int improve(br_mpc *mpc, int shifts) {
-    const br_timer *timer = &mpc->timer;
+    br_timer *timer = &mpc->timer;
     memset(&mpc->info, 0, sizeof mpc->info);
     mpc->penalty = 0;
     if (shifts) br_caution_update(mpc); /* else it is that of the last step */
@@ -472,10 +475,10 @@ static void look_elsewhere(br_mpc *mpc) {
  * real-time iteration (Nurkanovic, Zanelli, Albrecht, Diehl, "The advanced step real time iteration
  * for NMPC", 2019). */
 static void solve_ahead(br_mpc *mpc, double elapsed, int shifts) {
-    const br_timer *timer = &mpc->timer;
-    if (mpc->turn) return;               /* its reference is made from the measured state */
-    if (!(timer->iteration > 0)) return; /* no step has shown yet how long one takes */
-    const double needed = iteration_and_rest(timer) + (shifts ? timer->caution : 0);
+    br_timer *timer = &mpc->timer;
+    if (mpc->turn) return; /* its reference is made from the measured state */
+    double needed = iteration_and_rest(timer) + (shifts ? timer->caution : 0);
+    if (!(timer->iteration > 0)) needed = INFINITY; /* no step has shown yet how long one takes */
     if (!br_timer_allows(timer, br_timer_now(timer), needed)) return;
     if (!mpc->valid[BR_LINEARISATION]) br_linearise_plan(mpc);
     double x0[BR_NX], u_before[BR_NU];
