@@ -1,7 +1,10 @@
 """How a plant process is started."""
 
-from pydantic import Field
+from typing import Self
 
+from pydantic import Field, model_validator
+
+from bayesrace.plant.faults import SensorFault, SensorFaultsSetting
 from bayesrace.plant.settings import CarSimulation
 from bayesrace.realtime import RealtimeSettings
 from bayesrace.transport import PLANT_ENDPOINT, Endpoints
@@ -20,6 +23,7 @@ class PlantSettings(CarSimulation):
     seed: int = Field(
         0, ge=0, description="seed of the sensors' errors, which are the same in each run"
     )
+    sensor_faults: SensorFaultsSetting = None
     realtime: RealtimeSettings = RealtimeSettings()
     controller_wait_s: float = Field(
         2.0, ge=0, le=60, description="how long a lockstep run waits for a controller to appear"
@@ -31,3 +35,14 @@ class PlantSettings(CarSimulation):
     def states_hz(self) -> float:
         """Rate of the states."""
         return self.rate_hz
+
+    @property
+    def faults(self) -> tuple[SensorFault, ...]:
+        """Of the sensors."""
+        return self.sensor_faults.root if self.sensor_faults else ()
+
+    @model_validator(mode="after")
+    def _can_fail(self) -> Self:
+        for one in self.faults:
+            one.check(self.instruments)
+        return self
