@@ -6,13 +6,13 @@
 """
 
 import math
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
 
+from bayesrace import clock
 from bayesrace.arrays import Floats
 from bayesrace.controller.driver import Decision, Driver
 from bayesrace.controller.interface import NO_PLAN, Controller, Environment, StepOutput
@@ -74,7 +74,7 @@ class Cycle:
         environment: Environment | None = None,
     ) -> None:
         """Answers a state of a lockstep run, then prepares for the next one."""
-        self.timing.released_ns = time.monotonic_ns()
+        self.timing.released_ns = clock.monotonic_ns()
         send(state, self.decide(state.time_s, environment=environment))
         self.prepare(self.driver.interval_s, 0.0)
 
@@ -86,22 +86,22 @@ class Cycle:
         environment: Environment | None = None,
     ) -> Decision:
         """:meth:`Driver.decide`, timed."""
-        begin_ns = time.perf_counter_ns()
+        begin_ns = clock.perf_counter_ns()
         decision = self.driver.decide(decided_at_s, budget_s, spent_s, environment)
-        self.timing.solve_us = (time.perf_counter_ns() - begin_ns) * 1e-3
+        self.timing.solve_us = (clock.perf_counter_ns() - begin_ns) * 1e-3
         return decision
 
     def prepare(self, period_s: float, budget_s: float) -> None:
         """:meth:`Driver.prepare`, timed."""
-        begin_ns = time.perf_counter_ns()
+        begin_ns = clock.perf_counter_ns()
         self.driver.prepare(period_s, budget_s)
-        self.timing.prepare_us = (time.perf_counter_ns() - begin_ns) * 1e-3
+        self.timing.prepare_us = (clock.perf_counter_ns() - begin_ns) * 1e-3
 
     def actuation(self, seq: int, state: State, decision: Decision) -> Actuation:
         """The message that answers ``state``."""
         return Actuation(
             seq=seq,
-            source_time_ns=time.monotonic_ns(),
+            source_time_ns=clock.monotonic_ns(),
             epoch=state.epoch,
             run=state.run,
             state_seq=state.seq,
@@ -121,7 +121,7 @@ class Cycle:
         numbers = {"cost": output.cost, "cost_shifted": output.cost_shifted, **output.numbers}
         return Telemetry(
             seq=seq,
-            source_time_ns=time.monotonic_ns(),
+            source_time_ns=clock.monotonic_ns(),
             run=state.run,
             state_seq=state.seq,
             status=decision.status,

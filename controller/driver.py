@@ -5,12 +5,12 @@ count, stop and go, delay compensation, the step, the fallback. Times are the pl
 say otherwise, so lockstep and free-running mode are the same here.
 """
 
-import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import IntEnum, StrEnum
 from typing import Any, Final
 
+from bayesrace import clock
 from bayesrace.controller.estimator import Belief, Measurement, fill, read
 from bayesrace.controller.interface import Controller, Environment, StepOutput
 from bayesrace.controller.native_step import Status
@@ -100,8 +100,9 @@ class Driver:
         limits = {"u_low": (car.d_min, -rate), "u_high": (car.d_max, rate)}
         driving = ffi.new("br_driving *", settings.cycle_values(car) | limits)
         artefact.check(library.br_cycle_set_driving(self._cycle, driving), "cycle settings")
-        clock = ffi.addressof(library, "br_mpc_monotonic")
-        library.br_cycle_set_clock(self._cycle, clock, ffi.NULL)
+        library.br_cycle_set_clock(
+            self._cycle, ffi.addressof(library, "br_mpc_monotonic"), ffi.NULL
+        )
         self._counters = library.br_cycle_counters(self._cycle)
         self._measured = ffi.new("br_measured *")
         self._measured.averaged = 1
@@ -199,6 +200,12 @@ class Driver:
         if self.decision.status in (Status.HALTED, Status.NO_STATE):
             return None
         return self.decision.level is not Level.SOLUTION
+
+    def live_by(self, now_s: Callable[[], float]) -> None:
+        """Budgets and execution times are measured by this clock [s], not by the system's."""
+        self._clock = self.controller.artefact.ffi.callback("double(void *)", lambda _: now_s())
+        null = self.controller.artefact.ffi.NULL
+        self._library.br_cycle_set_clock(self._cycle, self._clock, null)
 
     def stop(self) -> None:
         """From the next cycle on slow down along the line to standstill, and stay."""
@@ -341,7 +348,7 @@ class Driver:
             return None
         return BrakingPlan(
             seq=seq,
-            source_time_ns=time.monotonic_ns(),
+            source_time_ns=clock.monotonic_ns(),
             epoch=newest.epoch,
             run=newest.run,
             begins_s=max(plan.begins_s, 0.0),

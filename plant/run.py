@@ -1,13 +1,13 @@
 """One run of the plant, in lockstep or in real time; the same car below both."""
 
 import heapq
-import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import chain
 from typing import Final, NamedTuple
 
+from bayesrace import clock
 from bayesrace.messages import (
     ACTUATION,
     Actuation,
@@ -21,7 +21,7 @@ from bayesrace.messages import (
 from bayesrace.plant.car import CarRun, End, drive_lockstep, fault_end, truth_behind
 from bayesrace.plant.faults import FaultPlayer, SensorFault
 from bayesrace.plant.vehicle import Command, FmuFault, Vehicle, planned_at
-from bayesrace.realtime import SUSPENDED_S, sleep_until_ns
+from bayesrace.realtime import SUSPENDED_S
 from bayesrace.sensors import EXACT, Sensors
 from bayesrace.transport import LOCKSTEP_SPIN_S, Inbox, Item, Kind, Publisher
 from bayesrace.transport.hold import HOLD_MISSING, HoldWatch
@@ -173,10 +173,10 @@ class Run:
 
     def _answer_to(self, seq: int) -> tuple[float, ...] | End:
         """Waits for the actuation that answers this state, or for what ends the run."""
-        deadline = time.monotonic() + self.request.actuation_timeout_s
+        deadline = clock.monotonic() + self.request.actuation_timeout_s
         run = self.request.run
         while True:
-            item = self.inbox.get(deadline - time.monotonic())
+            item = self.inbox.get(deadline - clock.monotonic())
             if item is None:
                 return self._timed_out(seq)
             if item.kind is Kind.MESSAGE:
@@ -211,7 +211,7 @@ class Run:
         while True:
             begin_ns = start_ns + self.simulator.steps * period_ns
             end = self._pass(begin_ns + period_ns)
-            before_ns, late_ns = late_ns, time.monotonic_ns() - begin_ns - period_ns
+            before_ns, late_ns = late_ns, clock.monotonic_ns() - begin_ns - period_ns
             if late_ns - before_ns > SUSPENDED_S * 1e9:
                 # Not to be made up for: nobody could have driven the car meanwhile.
                 self.counters.suspended += 1
@@ -273,7 +273,7 @@ class Run:
             return None
         self.simulator.actuate(self._fresh(0))
         acting = self._held
-        while (left_ns := until_ns - time.monotonic_ns()) > 0:
+        while (left_ns := until_ns - clock.monotonic_ns()) > 0:
             if (end := self._receive(left_ns * 1e-9)) is not None:
                 return end
             new = max((one.actuation for one in self._waiting), key=_decided, default=None)
@@ -294,11 +294,11 @@ class Run:
     def _sleep_and_send(self, until_ns: int) -> None:
         """Sleep, sending the states whose delay is over in the meantime."""
         outbox = self._outbox
-        while outbox and outbox[0][0] <= max(until_ns, time.monotonic_ns()):
+        while outbox and outbox[0][0] <= max(until_ns, clock.monotonic_ns()):
             due_ns, state, x = outbox.popleft()
-            sleep_until_ns(due_ns)
+            clock.sleep_until_ns(due_ns)
             self._send(state, x)
-        sleep_until_ns(until_ns)
+        clock.sleep_until_ns(until_ns)
 
     def _receive(self, wait_s: float = 0.0) -> End | None:
         """Takes what has arrived by now, and no more: requests without end must not hold up the
