@@ -152,7 +152,7 @@ def test_a_place_is_along_the_track() -> None:
     track = load_track("harbour", 0.0)
     [puddle] = read_scenario("puddle").world(track).root
     at = track.position(4.0)
-    assert puddle.share_at(1.0, at[0], at[1]) == 0.8
+    assert puddle.share_at(1.0, at[0], at[1]) == 0.85
     assert puddle.share_at(1.0, at[0] + 0.31, at[1]) == 1.0
 
 

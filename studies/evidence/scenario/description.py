@@ -15,8 +15,6 @@ from bayesrace.plant.faults import SensorFaults
 from bayesrace.plant.world import World
 from bayesrace.studies.evidence.scenario.events import (
     Event,
-    KillEvent,
-    PauseEvent,
     SensorEvent,
     WeightsEvent,
     WorldEvent,
@@ -171,11 +169,6 @@ class Scenario(_Section):
     def wanted_weights(self) -> set[str]:
         """All that it names."""
         return {self.weights, *(o.weights for o in self.event if isinstance(o, WeightsEvent))}
-
-    @property
-    def restarts(self) -> bool:
-        """Whether processes are killed or stand still."""
-        return any(isinstance(one, KillEvent | PauseEvent) for one in self.event)
 
 
 def shipped() -> dict[str, Path]:
