@@ -78,6 +78,10 @@ MEASUREMENTS: Final = {
         "python -m benchmarks.interface --json {out}/interface.json", "interface.json",
         (*_STEP, "controller", "plant", "operation/closed_loop.py", "benchmarks/interface.py"),
     ),
+    "long_runs": Measurement(
+        "python -m benchmarks.long_runs --out {out} --json {out}/long.json", "long.json",
+        (*_STEP, "controller", "plant", "operation/drive.py", "benchmarks/long_runs.py"),
+    ),
     "paper": Measurement(
         "bayesrace paper --tracks {tracks} --data {data} --out {out}", "numbers.json",
         (*_RACE, "studies/paper"),

@@ -340,6 +340,10 @@ class Driver:
             self.last_error = self.controller.last_error or self.controller.artefact.text(text)
         return decision
 
+    def sent(self, decided_at_s: float, u: tuple[float, ...]) -> None:
+        """What another controller has sent, which drives: this one is its shadow."""
+        self._library.br_cycle_sent(self._cycle, decided_at_s, u)
+
     def braking(self, seq: int) -> BrakingPlan | None:
         """What the car's guard shall do if nothing more comes; None for a car that is halted or
         whose controller knows no line."""

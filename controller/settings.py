@@ -108,7 +108,7 @@ class FallbackSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    shifted_s: float = Field(
+    shifted_s: Annotated[float, Option("--bridge", unit="ms", per_unit=1000)] = Field(
         default=0.1, ge=0, le=2, description="how long after its first input a plan may be driven"
     )
     recover_cycles: int = Field(

@@ -180,6 +180,7 @@ class PlantProcess:
                 hold=self._hold,
                 epoch=self._epoch,
                 delay_s=self._settings.delay_s,
+                buffer_s=self._settings.buffer_s,
                 sensors=self._settings.instruments,
                 seed=self._settings.seed,
                 faults=self._settings.faults,

@@ -1,9 +1,10 @@
 """How a plant process is started."""
 
-from typing import Self
+from typing import Annotated, Self
 
 from pydantic import Field, model_validator
 
+from bayesrace.defaults import Option
 from bayesrace.plant.faults import SensorFault, SensorFaultsSetting
 from bayesrace.plant.settings import CarSimulation
 from bayesrace.realtime import RealtimeSettings
@@ -19,6 +20,13 @@ class PlantSettings(CarSimulation):
     endpoints: Endpoints = Endpoints(listen=(PLANT_ENDPOINT,))
     rate_hz: float = Field(
         50.0, ge=1, le=500, description="rate of the states [Hz]; their period in lockstep"
+    )
+    buffer_s: Annotated[float, Option(unit="ms", per_unit=1000)] = Field(
+        0.0,
+        ge=0,
+        le=0.5,
+        description="jitter buffer, in real time: time from a decision until its input acts, at "
+        "least, so that delays which vary become one that is constant",
     )
     seed: int = Field(
         0, ge=0, description="seed of the sensors' errors, which are the same in each run"

@@ -38,6 +38,8 @@ _OVERDUE: Final = 1.5
 _LONGEST_S: Final = 0.1
 """... which counts as no longer than this [s]."""
 
+_NEVER: Final = -1.0
+"""In place of a delay, see ``State.actuation_delays``."""
 _MOST_DELAYS: Final = 64
 """Rows of ``State.actuation_delays`` that one message has room for."""
 
@@ -104,6 +106,8 @@ class Run:
     epoch: int
     delay_s: float = 0.0
     """Added to states and to actuations."""
+    buffer_s: float = 0.0
+    """From the decision on an input until it acts, at least: :attr:`.PlantSettings.buffer_s`."""
     sensors: Sensors = EXACT
     seed: int = 0
     """Of what they add."""
@@ -114,6 +118,7 @@ class Run:
         played = self.sensors, 2 * self.delay_s, self.seed
         self._car = CarRun(self.request, self.simulator, self.epoch, *played)
         self._delay_ns = round(self.delay_s * 1e9)
+        self._start_ns = 0
         self._pauses = 0
         # In real time:
         self._outbox: deque[tuple[int, State, tuple[float, ...]]] = deque()
@@ -205,7 +210,8 @@ class Run:
         period_ns = round(self.simulator.step_s * 1e9)
         seq = self.states.next_seq
         first = self._car.sample(seq)
-        start_ns, late_ns = first[0].source_time_ns, 0
+        late_ns = 0
+        self._start_ns = start_ns = first[0].source_time_ns
         self.simulator.begins(start_ns)
         self._enqueue(*first)
         while True:
@@ -217,6 +223,7 @@ class Run:
                 self.counters.suspended += 1
                 self.suspended(late_ns * 1e-9)
                 start_ns, begin_ns, late_ns = start_ns + late_ns, begin_ns + late_ns, 0
+                self._start_ns = start_ns
                 self.simulator.begins(start_ns)
             self.counters.overruns += late_ns > period_ns
             asked = end or self._receive()
@@ -276,7 +283,9 @@ class Run:
         while (left_ns := until_ns - clock.monotonic_ns()) > 0:
             if (end := self._receive(left_ns * 1e-9)) is not None:
                 return end
-            new = max((one.actuation for one in self._waiting), key=_decided, default=None)
+            now_ns = clock.monotonic_ns()
+            due = (one.actuation for one in self._waiting if one.acts_ns <= now_ns)
+            new = max(due, key=_decided, default=None)
             if new is None or self._lost_s is not None:
                 continue
             if acting is None or _decided(new) > _decided(acting):
@@ -322,9 +331,11 @@ class Run:
                 if not mine or ahead or not known:
                     self.counters.stale += 1
                     continue
-                waiting = _Waiting(
-                    item.received_ns + self._delay_ns, self.numbering.received, actuation
+                due_s = actuation.decided_at_s + self.buffer_s if self.buffer_s else 0.0
+                acts_ns = max(
+                    item.received_ns + self._delay_ns, self._start_ns + round(due_s * 1e9)
                 )
+                waiting = _Waiting(acts_ns, self.numbering.received, actuation)
                 heapq.heappush(self._waiting, waiting)
             elif (end := self.react(item)) is not None:
                 return end
@@ -338,21 +349,23 @@ class Run:
         substep_ns = simulator.step_s * 1e9 / simulator.substeps
         commands: list[tuple[int, Command]] = []
         delays: list[float] = []
-        done = 0
+        done, came = 0, False
         while self._waiting and self._waiting[0].acts_ns < end_ns:
             acts_ns, _, new = heapq.heappop(self._waiting)
             arrival_s = (acts_ns - self._sampled_ns.get(new.state_seq, acts_ns)) * 1e-9
             if self._held is not None and new.decided_at_s <= self._held.decided_at_s:
                 self.counters.stale += 1
-                delays += (float(new.state_seq), arrival_s, -1.0)
+                delays += (float(new.state_seq), arrival_s, _NEVER)
                 continue
             # It acts from the first substep that begins after its arrival.
             at = min(max(-int((begin_ns - acts_ns) // substep_ns), done), simulator.substeps)
             if at > done:
                 commands.append((at - done, self._fresh(done)))
+            elif came:  # with the one before, as after a link was held up: that one never acts
+                delays[-1] = _NEVER
             before_s = new.decided_at_s if self._held is None else self._held.decided_at_s
             self._interval_s = min(new.decided_at_s - before_s, _LONGEST_S)
-            self._held, done = new, at
+            self._held, done, came = new, at, True
             self._held_since_s = simulator.time_s + at * substep_ns * 1e-9
             acting_s = self._held_since_s - new.decided_at_s + simulator.command_s
             delays += (float(new.state_seq), arrival_s, acting_s)

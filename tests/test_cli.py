@@ -24,7 +24,7 @@ EVIL = "a\x1b[2Jb\x07c"
 SUBCOMMANDS = (
     "race", "drive", "report", "bench", "tracks", "cars", "raceline", "collect", "identify",
     "train", "build", "export", "limit",
-    "plant", "controller", "status", "stop", "go", "router", "latency",
+    "plant", "controller", "shadow", "status", "stop", "go", "router", "latency",
     "fmu export", "fmu inspect", "fmu weights",
     "validate", "publish", "rollback", "learn",
     "campaign", "campaign-report", "campaign-scheduler", "campaign-worker", "tune", "paper",

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from bayesrace import clock
@@ -73,11 +74,11 @@ def drive(
 
     def driven(
         happens: Callable[[SimulatedSystem], object] = lambda _: None, plan: RunPlan = LAP,
-        make: Callable[[], PredictiveController] = best_case,
+        make: Callable[[], PredictiveController] = best_case, buffer_s: float = 0.0,
         **settings: Any,
     ) -> Recorded:  # fmt: skip
         log = tmp_path / f"{len(list(tmp_path.glob('*.mcap')))}.mcap"
-        writer, plant = LogWriter(log), PlantSettings(car=car)
+        writer, plant = LogWriter(log), PlantSettings(car=car, buffer_s=buffer_s)
         with SimulatedSystem(circuit.track, make, writer, plant, **settings) as system:
             happens(system)
             end = system.drive(plan)
@@ -140,6 +141,39 @@ def test_what_a_link_loses_is_counted(drive: Drive) -> None:
     # those on their way at the end are neither
     assert abs(len(recorded.messages(STATE)) - received - lost) <= 2
     assert recorded.plant["actuations_lost"] > 0
+
+
+def delays_s(recorded: Recorded) -> list[float]:
+    """From the decision on each input that acted until it did."""
+    reports = (one.actuation_delays[2::3] for one in recorded.messages(STATE))
+    return [delay_s for report in reports for delay_s in report if delay_s >= 0]
+
+
+def test_inputs_that_arrive_at_once_count_as_one_and_do_not_change_the_delay(drive: Drive) -> None:
+    """After a link was held up, all but the newest are old, and never act."""
+
+    def happens(system: SimulatedSystem) -> None:
+        for after_s in (1.0, 1.3):
+            system.at(after_s, system.ways["plant"].hold)
+            system.at(after_s + 0.15, system.ways["plant"].release)
+
+    recorded = drive(happens, link=Link(0.01))
+    arrived = sum(len(one.actuation_delays) // 3 for one in recorded.messages(STATE))
+    assert arrived - len(delays_s(recorded)) >= 10
+    known = [one.delay_s for one in recorded.messages(TELEMETRY)[20:]]
+    assert max(known) < min(known) + 0.005
+    assert recorded.off_track == 0
+
+
+def test_a_jitter_buffer_makes_delays_that_vary_constant(drive: Drive) -> None:
+    rough = Link(0.03, 0.03, 0.02, ordered=False)
+    bare, buffered = drive(link=rough), drive(link=rough, buffer_s=0.1)
+    spread_s = [np.ptp(np.percentile(delays_s(one), (2, 95))) for one in (bare, buffered)]
+    assert spread_s[0] > 0.04
+    assert spread_s[1] < 0.005
+    assert min(delays_s(buffered)) >= 0.1 - 1e-6
+    assert bare.off_track > buffered.off_track == 0
+    assert buffered.end.data["reason"] == "laps"
 
 
 def test_a_controller_that_is_stopped_for_a_while_goes_on(drive: Drive) -> None:

@@ -240,6 +240,10 @@ BR_API br_mpc_error br_cycle_decide(br_cycle *cycle, const br_environment *envir
                                     double decided_at_s, double budget_s, double spent_s,
                                     br_decision *decision);
 
+/* What another controller has sent, which drives while this one only decides: it acts in place of
+ * what this one has decided at that plant time, or beside it. */
+BR_API void br_cycle_sent(br_cycle *cycle, double decided_at_s, const double u[BR_NU]);
+
 /* br_mpc_prepare for a state that is expected a period after the last one, where one is. */
 BR_API void br_cycle_prepare(br_cycle *cycle, double period_s, double budget_s);
 

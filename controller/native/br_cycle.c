@@ -547,6 +547,12 @@ br_mpc_error br_cycle_decide(br_cycle *cycle, const br_environment *environment,
     return BR_OK;
 }
 
+void br_cycle_sent(br_cycle *cycle, double decided_at_s, const double u[BR_NU]) {
+    if (!cycle || !u || !isfinite(decided_at_s)) return;
+    br_delay_replace(&cycle->delay, decided_at_s, u);
+    memcpy(cycle->decision.u, u, sizeof cycle->decision.u);
+}
+
 br_mpc_error br_cycle_brake(const br_cycle *cycle, br_braking *braking) {
     if (!cycle || !braking) return BR_ERROR_NULL;
     if (!cycle->acting || !cycle->controller.steer) return BR_ERROR_NOT_READY;

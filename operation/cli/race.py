@@ -119,6 +119,12 @@ def drive(
     laps: int = options.value("Laps to drive, the first from rest.", 2, min=1),
     max_time: float = options.value("Time limit [s].", 60.0, min=1, max=1e6, metavar="S"),
     log: Path = options.new_file("Log to write (MCAP).", default=Path("run.mcap")),
+    max_log: str | None = options.value(
+        "Size of the log at most, as 500MB or 2GB: it goes on in new files, run.1.mcap and so on, "
+        "and the oldest are deleted.",
+        metavar="SIZE",
+        shown="no limit",
+    ),
     name: str = options.CAR_NAME,
     hold_to_run: bool = options.flag(
         "--hold-to-run",
@@ -130,6 +136,7 @@ def drive(
     Exit code 0 if all laps were driven on the track, by the controller's solutions; 1 if not; 2 if
     the run could not be driven to its end.
     """
+    from bayesrace.log_parts import log_size
     from bayesrace.operation.drive import drive_and_judge
     from bayesrace.operation.run_plan import RunPlan
     from bayesrace.tracks import load_track
@@ -138,7 +145,9 @@ def drive(
     course = load_track(chosen.track, chosen.car.width_m)
     held = hold_to_run or configuration.drive.hold_to_run
     plan = RunPlan(0, "manual", laps, max_time, chosen.mode == "lockstep", held=held)
-    end, verdict = drive_and_judge(director, chosen.car, name or chosen.car.name, course, plan, log)
+    limit = configuration.drive.max_log if max_log is None else log_size(max_log)
+    name = name or chosen.car.name
+    end, verdict = drive_and_judge(director, chosen.car, name, course, plan, log, limit)
     typer.echo(f"{end.text}; log: {log}\n{verdict.text}")
     if not verdict.passed:
         raise typer.Exit(1)

@@ -94,6 +94,7 @@ class Scenario(_Section):
     weights: str = Field(
         "updated", description="that the controller begins with: learned, updated, none or a file"
     )
+    buffer_ms: float = Field(0.0, ge=0, le=500, description="jitter buffer of the plant [ms]")
     seed: int = Field(0, ge=0, description="of the link's randomness")
     race: PreparationSettings = Field(
         default_factory=PreparationSettings, description="settings of 'bayesrace race'"

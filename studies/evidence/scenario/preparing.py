@@ -55,6 +55,7 @@ class Ready:
         values |= {
             "car": race.true_car, "world": one.world(self.prepared.first.track),
             "rate_hz": one.states_hz, "seed": race.seed, "sensor_faults": one.faults,
+            "buffer_s": 1e-3 * one.buffer_ms,
         }  # fmt: skip
         return PlantSettings.model_validate(values)
 

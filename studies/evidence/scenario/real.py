@@ -201,6 +201,7 @@ def _plant_options(ready: Ready, folder: Path) -> list[str]:
     pairs: list[tuple[str, object]] = [
         ("--car", folder / "car.toml"), ("--rate", settings.rate_hz), ("--seed", settings.seed),
         ("--simulator", settings.simulator), ("--delay", 1e3 * settings.delay_s),
+        ("--buffer", 1e3 * settings.buffer_s),
         ("--sensors", folder / "sensors.toml" if settings.instruments.root else "exact"),
     ]  # fmt: skip
     write_car(folder / "car.toml", settings.car)
