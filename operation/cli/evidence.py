@@ -1,4 +1,4 @@
-"""``scenario``, ``shadow``: evidence about a controller before it drives, with a verdict and an exit code."""
+"""``scenario``, ``shadow``: evidence about a controller before it drives, with a verdict."""
 
 from pathlib import Path
 from typing import Any
