@@ -75,17 +75,15 @@ class Relay:
         }
         self.join()
 
-    def set(
-        self,
-        delay_s: float = 0.0,
-        jitter_s: float = 0.0,
-        loss: float = 0.0,
-        direction: str = "",
-    ) -> None:
-        """Time on the way, uniform in ``delay_s`` ± ``jitter_s``, and probability of a loss; both
-        directions without one."""
-        for way in self._chosen(direction):
-            way.delay_s, way.jitter_s, way.loss = delay_s, jitter_s, loss
+    def set(self, delay_s: float = 0.0, jitter_s: float = 0.0, loss: float = 0.0) -> None:
+        """Time on the way, uniform in ``delay_s`` ± ``jitter_s``, and probability of a loss."""
+        for direction in self._ways:
+            self.set_way(direction, delay_s, jitter_s, loss)
+
+    def set_way(self, direction: str, delay_s: float, jitter_s: float, loss: float) -> None:
+        """The same of one direction."""
+        way = self._ways[direction]
+        way.delay_s, way.jitter_s, way.loss = delay_s, jitter_s, loss
 
     def hold(self, direction: str = "") -> None:
         """Nothing gets through any more; both directions without one."""

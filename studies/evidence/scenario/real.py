@@ -58,7 +58,7 @@ class _Processes:
         return self.relay
 
     def set_link(self, to: Part, link: Link) -> None:
-        self._link().set(link.delay_s, link.jitter_s, link.loss, _WAYS[to])
+        self._link().set_way(_WAYS[to], link.delay_s, link.jitter_s, link.loss)
 
     def hold(self, to: Part) -> None:
         self._link().hold(_WAYS[to])
