@@ -183,6 +183,7 @@ class PlantProcess:
                 buffer_s=self._settings.buffer_s,
                 sensors=self._settings.instruments,
                 seed=self._settings.seed,
+                faults=self._settings.faults,
             )
         except (InputError, FmuFault) as error:
             return str(error)
@@ -378,6 +379,8 @@ def main(
     )  # fmt: skip
     if hardware is not None and (settings.delay_s or settings.changes.root):
         raise InputError("a real car has delays and a world of its own: leave out delay_s, world")
+    if hardware is not None and settings.sensor_faults:
+        raise InputError("sensors of a real car fail by themselves: leave out sensor_faults")
     settings.endpoints.check_car(settings.name or settings.car.name)
     with vehicles as vehicle, open_sessions(settings.endpoints, "plant") as sessions:
         process = PlantProcess(sessions.current, settings, vehicle)

@@ -1,10 +1,11 @@
 """How a plant process is started."""
 
-from typing import Annotated
+from typing import Annotated, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from bayesrace.defaults import Option
+from bayesrace.plant.faults import SensorFault, SensorFaultsSetting
 from bayesrace.plant.settings import CarSimulation
 from bayesrace.realtime import RealtimeSettings
 from bayesrace.transport import PLANT_ENDPOINT, Endpoints
@@ -30,6 +31,7 @@ class PlantSettings(CarSimulation):
     seed: int = Field(
         0, ge=0, description="seed of the sensors' errors, which are the same in each run"
     )
+    sensor_faults: SensorFaultsSetting = None
     realtime: RealtimeSettings = RealtimeSettings()
     controller_wait_s: float = Field(
         2.0, ge=0, le=60, description="how long a lockstep run waits for a controller to appear"
@@ -41,3 +43,14 @@ class PlantSettings(CarSimulation):
     def states_hz(self) -> float:
         """Rate of the states."""
         return self.rate_hz
+
+    @property
+    def faults(self) -> tuple[SensorFault, ...]:
+        """Of the sensors."""
+        return self.sensor_faults.root if self.sensor_faults else ()
+
+    @model_validator(mode="after")
+    def _can_fail(self) -> Self:
+        for one in self.faults:
+            one.check(self.instruments)
+        return self

@@ -2,7 +2,7 @@
 
 import heapq
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import chain
 from typing import Final, NamedTuple
@@ -19,6 +19,7 @@ from bayesrace.messages import (
     Truth,
 )
 from bayesrace.plant.car import CarRun, End, drive_lockstep, fault_end, truth_behind
+from bayesrace.plant.faults import FaultPlayer, SensorFault
 from bayesrace.plant.vehicle import Command, FmuFault, Vehicle, planned_at
 from bayesrace.realtime import SUSPENDED_S
 from bayesrace.sensors import EXACT, Sensors
@@ -110,8 +111,10 @@ class Run:
     sensors: Sensors = EXACT
     seed: int = 0
     """Of what they add."""
+    faults: Sequence[SensorFault] = ()
 
     def __post_init__(self) -> None:
+        self._faults = FaultPlayer(self.faults)
         played = self.sensors, 2 * self.delay_s, self.seed
         self._car = CarRun(self.request, self.simulator, self.epoch, *played)
         self._delay_ns = round(self.delay_s * 1e9)
@@ -154,7 +157,7 @@ class Run:
 
     def _send(self, state: State, x: tuple[float, ...]) -> None:
         """The truth goes second: it must not delay the measurement. Of a real car there is none."""
-        self.states.put(state, lockstep=state.lockstep)
+        self.states.put(self._faults.report(state), lockstep=state.lockstep)
         if not self.simulator.real:
             self.truths.put(truth_behind(state, x), lockstep=state.lockstep)
 

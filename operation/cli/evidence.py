@@ -1,14 +1,14 @@
-"""``replay``, ``shadow``: evidence about a controller before it drives, each with a verdict."""
+"""``replay``, ``scenario``, ``shadow``: evidence about a controller before it drives, each with a verdict."""
 
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import typer
 
 from bayesrace.errors import InputError
 from bayesrace.operation.cli import options
 
-__all__ = ["replay", "shadow"]
+__all__ = ["replay", "scenario", "shadow"]
 
 
 def replay(
@@ -66,6 +66,76 @@ def replay(
     if junit is not None:
         verdict.write_junit(junit)
     raise typer.Exit(verdict.exit_code)
+
+
+def scenario(
+    files: list[str] = options.argument(
+        "SCENARIO", "TOML files, or names of those that ship.", (), shown="none"
+    ),
+    every: bool = options.flag("--all", "All that ship."),
+    listed: bool = options.flag("--list", "Name those that ship, and drive none."),
+    changed: list[str] = options.value(
+        "Value to change, as event.0.delay_ms=20; repeatable.",
+        (),
+        "--set",
+        metavar="PLACE=VALUE",
+        shown="none",
+    ),
+    workers: int = options.value(
+        "Simulated drives at once.", 0, min=0, max=1024, shown="one a core"
+    ),
+    out: Path | None = options.out_folder(
+        "Folder for recordings and report.", "runs/scenario-DATE-TIME"
+    ),
+    junit: Path | None = options.new_file("Write the checks to this file (JUnit XML).", "--junit"),
+) -> None:
+    """Drive scenarios, what happens in them included, and check what must hold.
+
+    In simulated time, the same to the bit each time, or in real time, with processes. Leaves a page
+    with a row each, scenarios.json and the recordings. Exit code 0 if everything holds, 1 if not.
+    """
+    from bayesrace.studies.evidence.scenario.description import read_scenario, shipped
+
+    if listed:
+        for name in shipped():
+            typer.echo(f"{name}: {read_scenario(name).why}")
+        return
+    names = [*files, *(shipped() if every else ())]
+    if not names:
+        raise InputError("no scenario: name files, or those that --list names, or --all")
+    values = dict(_set(one) for one in changed)
+    scenarios = {one.name: one for one in (read_scenario(name, values) for name in names)}
+    drive_and_judge(list(scenarios.values()), options.run_folder(out, "scenario-"), junit, workers)
+
+
+def drive_and_judge(scenarios: Any, folder: Path, junit: Path | None, workers: int) -> None:
+    """Drives, prints the verdict, leaves the report; exit code 1 if something does not hold."""
+    from bayesrace.operation.terminal.terminal import Terminal
+    from bayesrace.studies.evidence.scenario.report import write_report
+    from bayesrace.studies.evidence.scenario.run import run_scenarios, verdict_of
+
+    with options.stages_shown() as stages:
+        results = run_scenarios(scenarios, folder, stages, workers)
+    verdict = verdict_of(results)
+    verdict.print(Terminal())
+    if junit is not None:
+        verdict.write_junit(junit)
+    typer.echo(f"{write_report(results, folder)}")
+    if not verdict.passed:
+        raise typer.Exit(1)
+
+
+def _set(given: str) -> tuple[str, Any]:
+    """Place and value of ``--set``; a value that TOML does not know is a text."""
+    from bayesrace.files import parse_toml
+
+    place, equals, text = given.partition("=")
+    if not equals:
+        raise InputError(f"--set {given}: write PLACE=VALUE, as event.0.delay_ms=20")
+    try:
+        return place, parse_toml(f"value = {text}", "--set", "")["value"]
+    except InputError:
+        return place, text
 
 
 def shadow(

@@ -45,8 +45,8 @@ def _endpoint(text: str, shown: str = "as configured") -> Any:
 
 @options_of(
     "bayesrace.plant.process_settings.PlantSettings",
-    "car name rate_hz fmu fmu_map simulator delay_s buffer_s sensors world seed realtime.cpu "
-    "realtime.fifo realtime.lock_memory",
+    "car name rate_hz fmu fmu_map simulator delay_s buffer_s sensors sensor_faults world seed "
+    "realtime.cpu realtime.fifo realtime.lock_memory",
 )
 def plant(
     network: "Configuration",

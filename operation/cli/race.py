@@ -280,12 +280,25 @@ def campaign(
     key: Path | None = _KEY,
     workers: int = _WORKERS,
     again: bool = options.flag("--again", "Compute cases that failed once more."),
+    scenario: str | None = options.value(
+        "Scenario that the plan's [grid] varies, as event.0.delay_ms: docs/scenarios.md.",
+        metavar="FILE",
+    ),
 ) -> None:
     """Drive all cases of a plan, on this machine or on many; one row a lap in Parquet.
 
     What is there already is not computed again: the same command goes on after an interruption.
     Leaves laps.parquet and report.html.
     """
+    if scenario is not None:
+        from bayesrace.operation.cli.evidence import drive_and_judge
+        from bayesrace.studies.evidence.scenario.run import read_grid
+
+        if scheduler is not None or again:
+            raise InputError("--scenario is driven anew, here: leave out --scheduler and --again")
+        folder = out or Path("runs") / plan.stem
+        drive_and_judge(read_grid(plan, scenario), folder, None, workers)
+        return
     from bayesrace.operation.terminal.terminal import Terminal
     from bayesrace.studies.campaign.campaign import run_campaign
     from bayesrace.studies.campaign.plan import read_plan
