@@ -28,7 +28,8 @@ SUBCOMMANDS = (
     "fmu export", "fmu inspect", "fmu weights",
     "validate", "publish", "rollback", "learn",
     "campaign", "campaign-report", "campaign-scheduler", "campaign-worker", "tune", "paper",
-    "replay", "scenario", "config show", "config check", "config example", "config firewall", "doctor",
+    "replay", "scenario",
+    "config show", "config check", "config example", "config firewall", "doctor",
     "certs init", "certs add", "certs list", "certs revoke",
 )  # fmt: skip
 

@@ -1,4 +1,4 @@
-"""``replay``, ``scenario``, ``shadow``: evidence about a controller before it drives, each with a verdict."""
+"""``replay``, ``scenario``, ``shadow``: evidence about a controller, each with a verdict."""
 
 from pathlib import Path
 from typing import Any, Literal
