@@ -370,3 +370,15 @@ def test_json_names_the_numbers_of_states_and_inputs() -> None:
 def test_any_bytes_are_refused_as_json(kind: type[Message], data: bytes) -> None:
     with pytest.raises(InputError):
         decode_json(kind, data)
+
+
+def test_telemetry_of_earlier_releases_is_read() -> None:
+    """It has no fields for replays: these say that they were not reported."""
+    later = ("states", "late_s", "refused", "prepared_s", "prepared_refused")
+    new = Telemetry(**values(Telemetry, random.Random(1)))
+    fields = {
+        name: value for name, value in msgpack.unpackb(encode(new)).items() if name not in later
+    }
+    old = decode(Telemetry, msgpack.packb(fields))
+    assert [getattr(old, name) for name in later] == [-1, 0.0, (), -1.0, ()]
+    assert old.plan_x == new.plan_x

@@ -22,7 +22,7 @@ from bayesrace.operation.system import started_system
 from bayesrace.operation.terminal.terminal import stages_on
 from bayesrace.raceline import write_raceline
 from bayesrace.recorder import Recorder
-from bayesrace.studies.evidence.replay.comparison import tolerance
+from bayesrace.studies.evidence.inputs import input_bounds
 from bayesrace.studies.evidence.replay.controller import Given
 from bayesrace.studies.evidence.replay.recording import read_lives
 from bayesrace.studies.evidence.replay.run import find_drives, replay
@@ -144,13 +144,13 @@ def test_after_a_lost_message_cycles_are_counted_and_not_judged(
 def test_another_controller_parts_where_it_is_said_and_why(lockstep: Path, tmp_path: Path) -> None:
     other = tmp_path / "other.json"
     other.write_text(MpcSettings(iterations=4, margin_m=0.08).model_dump_json())
-    given, allowed = Given(mpc=other), tolerance("d=1e-9,delta_rate=1e-9")
+    given, allowed = Given(mpc=other), input_bounds("", "d=1e-9,delta_rate=1e-9")
     inputs, levels = replayed(lockstep, given=given, allowed=allowed).checks
     assert not inputs.passed
     assert "they part at state" in inputs.found
     assert "iterations" in inputs.found or "at bounds" in inputs.found
     assert "cost of the plan" in levels.found
-    wide = replayed(lockstep, given=given, allowed=tolerance("d=9,delta_rate=99"))
+    wide = replayed(lockstep, given=given, allowed={"d": 9, "delta_rate": 99})
     assert wide.checks[0].passed
     (alone,) = replayed(lockstep, given=given).checks  # no bound on inputs is asked for
     assert "by the fallback" in alone.name
@@ -175,7 +175,7 @@ def test_a_library_is_compared_with_a_baseline(lockstep: Path, tmp_path: Path) -
     verdict = replayed(drives, against=base, out=now)
     assert [one.passed for one in verdict.checks] == [True, False]
     assert "274 of 275" in verdict.checks[1].found
-    assert replayed(drives, against=base, allowed=(1e-5, 1e-5)).passed
+    assert replayed(drives, against=base, allowed={"d": 1e-5}).passed
 
 
 @pytest.mark.parametrize("host", ["c", "fmu"])
@@ -198,9 +198,9 @@ def test_the_command_exits_by_its_verdict_and_writes_junit(lockstep: Path, tmp_p
     other.write_text(MpcSettings(margin_m=0.08).model_dump_json())
     options = ("--settings", other, "--tolerance", "d=1e-9,delta_rate=1e-9")
     assert finish(start("replay", lockstep, *options)).returncode == 1
-    wrong = finish(start("replay", lockstep, "--tolerance", "d=1e-9"))
+    wrong = finish(start("replay", lockstep, "--tolerance", "d=x"))
     assert wrong.returncode == 2
-    assert "one for each input" in wrong.stderr
+    assert "--tolerance d=x: give d, delta_rate or both" in wrong.stderr
 
 
 def test_what_is_missing_is_named(lockstep: Path, tmp_path: Path) -> None:

@@ -1,14 +1,33 @@
-"""``replay``, ``scenario``, ``shadow``: evidence about a controller, each with a verdict."""
+"""``replay``, ``scenario``, ``shadow``, ``timing``: evidence about a controller, with verdicts."""
 
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Final, Literal
 
 import typer
 
 from bayesrace.errors import InputError
 from bayesrace.operation.cli import options
+from bayesrace.operation.cli.declaration import Given, options_of
 
-__all__ = ["replay", "scenario", "shadow"]
+if TYPE_CHECKING:
+    from bayesrace.studies.evidence.timing.settings import TimingSettings
+    from bayesrace.studies.evidence.verdict import Verdict
+
+__all__ = ["replay", "scenario", "shadow", "timing"]
+
+_JUNIT: Final = options.new_file("Write the verdict as JUnit XML to this file.", "--junit")
+
+
+def _end(verdict: "Verdict", junit: Path | None, left: Path | None = None) -> None:
+    """Prints the verdict and where files are ``left``, and exits by it."""
+    from bayesrace.operation.terminal.terminal import Terminal
+
+    verdict.print(Terminal())
+    if junit is not None:
+        verdict.write_junit(junit)
+    if left is not None:
+        typer.echo(f"{left}")
+    raise typer.Exit(verdict.exit_code)
 
 
 def replay(
@@ -27,7 +46,7 @@ def replay(
         "What hosts the controller: python; c or fmu, for lockstep drives.", "python"
     ),
     tolerance: str = options.value(
-        "Largest differences, as d=1e-9,delta_rate=1e-7.",
+        "Largest differences, as d=1e-9,delta_rate=1e-7; of one not named 0.",
         "",
         metavar="TOLERANCE",
         shown="0 for the recorded controller, none for another",
@@ -45,7 +64,7 @@ def replay(
     mpc: Path | None = options.value(
         "OCP settings (JSON).", None, "--settings", shown="mpc.json beside the log"
     ),
-    junit: Path | None = options.new_file("Write the verdict as JUnit XML to this file."),
+    junit: Path | None = _JUNIT,
     out: Path | None = options.out_folder("Folder for result, inputs and pictures."),
 ) -> None:
     """Feed a controller what another was told in recorded drives, and compare the inputs.
@@ -53,19 +72,15 @@ def replay(
     By the recorded controller they are equal to the bit, in real time as well. Exit code 1 if a
     check fails; see docs/replay.md.
     """
-    from bayesrace.operation.terminal.terminal import Terminal
-    from bayesrace.studies.evidence.replay.comparison import tolerance as parsed
-    from bayesrace.studies.evidence.replay.controller import Given
+    from bayesrace.studies.evidence.inputs import input_bounds
+    from bayesrace.studies.evidence.replay.controller import Given as Replaced
     from bayesrace.studies.evidence.replay.run import replay as replay_all
 
-    allowed = parsed(tolerance) if tolerance else None
-    given = Given(controller, weights, host, car, track, raceline, mpc)
+    allowed = input_bounds("--tolerance", tolerance) if tolerance else None
+    given = Replaced(controller, weights, host, car, track, raceline, mpc)
     with options.stages_shown() as stages:
         verdict = replay_all(logs, given, stages, allowed, against, out)
-    verdict.print(Terminal())
-    if junit is not None:
-        verdict.write_junit(junit)
-    raise typer.Exit(verdict.exit_code)
+    _end(verdict, junit)
 
 
 def scenario(
@@ -87,7 +102,7 @@ def scenario(
     out: Path | None = options.out_folder(
         "Folder for recordings and report.", "runs/scenario-DATE-TIME"
     ),
-    junit: Path | None = options.new_file("Write the checks to this file (JUnit XML).", "--junit"),
+    junit: Path | None = _JUNIT,
 ) -> None:
     """Drive scenarios, what happens in them included, and check what must hold.
 
@@ -109,20 +124,13 @@ def scenario(
 
 
 def drive_and_judge(scenarios: Any, folder: Path, junit: Path | None, workers: int) -> None:
-    """Drives, prints the verdict, leaves the report; exit code 1 if something does not hold."""
-    from bayesrace.operation.terminal.terminal import Terminal
+    """Drives, prints the verdict, leaves the report, and exits by it."""
     from bayesrace.studies.evidence.scenario.report import write_report
     from bayesrace.studies.evidence.scenario.run import run_scenarios, verdict_of
 
     with options.stages_shown() as stages:
         results = run_scenarios(scenarios, folder, stages, workers)
-    verdict = verdict_of(results)
-    verdict.print(Terminal())
-    if junit is not None:
-        verdict.write_junit(junit)
-    typer.echo(f"{write_report(results, folder)}")
-    if not verdict.passed:
-        raise typer.Exit(1)
+    _end(verdict_of(results), junit, write_report(results, folder))
 
 
 def _set(given: str) -> tuple[str, Any]:
@@ -154,7 +162,7 @@ def shadow(
     ),
     car: str = options.value("TOML file of the weights' car if it is not built in.", ""),
     track: str | None = options.value("Track, for places along it: name or CSV file."),
-    junit: Path | None = options.new_file("Write the verdict as JUnit XML to this file."),
+    junit: Path | None = _JUNIT,
     out: Path | None = options.out_folder("Folder for shadow.json and pictures."),
 ) -> None:
     """Judge shadows ('bayesrace controller --shadow') by the drives that they were beside.
@@ -164,7 +172,8 @@ def shadow(
     """
     from bayesrace.gp.weights import read_weights
     from bayesrace.operation.terminal.terminal import Terminal
-    from bayesrace.studies.evidence.shadow.judgement import bounds, judge_shadows
+    from bayesrace.studies.evidence.inputs import input_bounds
+    from bayesrace.studies.evidence.shadow.judgement import judge_shadows
     from bayesrace.tracks import load_track
     from bayesrace.vehicles import get_car
 
@@ -172,9 +181,38 @@ def shadow(
         raise InputError("--against is for --weights: give both, or leave it out")
     new, old = (None if one is None else read_weights(one) for one in (weights, against))
     course = None if track is None else load_track(track)
-    console, parameters = Terminal(), get_car(car) if car else None
-    verdict = judge_shadows(logs, bounds(at_most), new, old, parameters, course, out, console)
-    verdict.print(console)
-    if junit is not None:
-        verdict.write_junit(junit)
-    raise typer.Exit(verdict.exit_code)
+    bounds, parameters = input_bounds("--at-most", at_most), get_car(car) if car else None
+    verdict = judge_shadows(logs, bounds, new, old, parameters, course, out, Terminal())
+    _end(verdict, junit)
+
+
+@options_of(
+    "bayesrace.studies.evidence.timing.settings.TimingSettings",
+    "tracks problems cases rate_hz budget at_most_ms exceedance horizon sensors weights artefact "
+    "points seed car",
+    file=True,
+)
+def timing(
+    settings: "Given[TimingSettings]",
+    logs: list[Path] = options.argument(
+        "LOG", "Run logs (MCAP) whose states are solved again; without, tracks are driven.", ()
+    ),
+    out: Path | None = options.out_folder("Folder for results.", "runs/timing-DATE-TIME"),
+    junit: Path | None = _JUNIT,
+) -> None:
+    """Show whether the controller answers in time: phases on recorded and on adversarial problems.
+
+    Searches for the hardest starts, compares the work with its bounds by construction, and
+    extrapolates. Leaves timing.json, a picture and all times. Exit code 0 if all checks hold, 1 if
+    not; see docs/timing.md.
+    """
+    from bayesrace.operation.terminal.terminal import Terminal
+    from bayesrace.studies.evidence.timing.report import print_study, write_study
+    from bayesrace.studies.evidence.timing.study import run_timing
+
+    folder = options.run_folder(out, "timing-")
+    with options.stages_shown() as stages:
+        study = run_timing(settings(), logs, stages)
+    write_study(study, folder)
+    print_study(study, Terminal())
+    _end(study.verdict, junit, folder)

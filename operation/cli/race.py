@@ -1,4 +1,4 @@
-"""``race``, ``report``, ``drive``, ``bench``, ``latency``, ``timing``, ``paper``, ``campaign``,
+"""``race``, ``report``, ``drive``, ``bench``, ``latency``, ``paper``, ``campaign``,
 ``campaign-report``, ``campaign-scheduler``, ``campaign-worker``, ``tune``: whole runs, and what is
 measured with them."""
 
@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from bayesrace.operation.analysis.race import RaceAnalysis
     from bayesrace.operation.settings import RaceSettings
     from bayesrace.studies.campaign.cluster import Remote
-    from bayesrace.studies.evidence.timing.settings import TimingSettings
     from bayesrace.studies.latency.settings import LatencySettings
     from bayesrace.studies.settings import BenchSettings, PaperSettings, TuneSettings
     from bayesrace.transport import Endpoints
@@ -32,7 +31,6 @@ __all__ = [
     "paper",
     "race",
     "report",
-    "timing",
     "tune",
 ]
 
@@ -216,41 +214,6 @@ def latency(
     typer.echo(f"{folder}")
     if run.error is not None:
         raise run.error
-
-
-@options_of(
-    "bayesrace.studies.evidence.timing.settings.TimingSettings",
-    "tracks problems cases rate_hz budget at_most_ms exceedance horizon sensors weights artefact "
-    "points seed car",
-    file=True,
-)
-def timing(
-    settings: "Given[TimingSettings]",
-    logs: list[Path] = options.argument(
-        "LOG", "Run logs (MCAP) whose states are solved again; without, tracks are driven.", ()
-    ),
-    out: Path | None = options.out_folder("Folder for results.", "runs/timing-DATE-TIME"),
-    junit: Path | None = options.new_file("Write the verdict as JUnit XML.", "--junit"),
-) -> None:
-    """Show whether the controller answers in time: phases on recorded and on adversarial problems.
-
-    Searches for the hardest starts, compares the work with its bounds by construction, and
-    extrapolates. Leaves timing.json, a picture and all times. Exit code 0 if all checks hold, 1 if
-    not; see docs/timing.md.
-    """
-    from bayesrace.operation.terminal.terminal import Terminal
-    from bayesrace.studies.evidence.timing.report import print_study, write_study
-    from bayesrace.studies.evidence.timing.study import run_timing
-
-    folder = options.run_folder(out, "timing-")
-    with options.stages_shown() as stages:
-        study = run_timing(settings(), logs, stages)
-    write_study(study, folder)
-    print_study(study, Terminal())
-    if junit is not None:
-        study.verdict.write_junit(junit)
-    typer.echo(f"{folder}")
-    raise typer.Exit(study.verdict.exit_code)
 
 
 @options_of("bayesrace.studies.settings.PaperSettings", "tracks data raceline quick seed")

@@ -1,7 +1,7 @@
 """What is compared of a recorded drive and its replay: inputs, where they part first, and why."""
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -9,18 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesrace.arrays import Flags, Floats
-from bayesrace.errors import InputError
 from bayesrace.messages import QUANTITIES
+from bayesrace.studies.evidence.inputs import INPUTS
 from bayesrace.studies.evidence.replay.hosts import Answer
 from bayesrace.studies.evidence.verdict import Check
 from bayesrace.vehicles import Car
 
-__all__ = ["INPUTS", "ROWS", "Replayed", "Tolerance", "parting", "rows_of", "tolerance"]
+__all__ = ["ROWS", "Replayed", "Tolerance", "parting", "rows_of"]
 
-INPUTS: Final = ("d", "delta_rate")
-
-Tolerance = tuple[float, float]
-"""Largest difference of each of :data:`INPUTS`; 0: to the bit."""
+Tolerance = Mapping[str, float] | None
+"""Largest differences of the inputs; of those that are not named, or None: to the bit."""
 
 ROWS: Final = np.dtype(
     [
@@ -32,35 +30,17 @@ ROWS: Final = np.dtype(
 """Of a cycle; ``known``: the recording says all that it depends on."""
 
 
-def tolerance(text: str) -> Tolerance:
-    """As ``d=1e-9,delta_rate=1e-7``; InputError for anything else."""
-    try:
-        found = {name: float(value) for name, value in (one.split("=") for one in text.split(","))}
-    except ValueError:
-        found = {}
-    if set(found) != set(INPUTS) or not all(0 <= one < np.inf for one in found.values()):
-        raise InputError(
-            f"--tolerance '{text}': give one for each input, as d=1e-9,delta_rate=1e-7"
-        )
-    return found["d"], found["delta_rate"]
-
-
 def rows_of(found: Sequence[Answer]) -> NDArray[Any]:
     """A row for each cycle that was answered."""
-    rows = np.zeros(len(found), ROWS)
-    for row, one in zip(rows, found, strict=True):
-        cycle, how = one.cycle, one.how
-        row["run"], row["state_seq"], row["seq"] = (
-            cycle.sent.run,
-            cycle.sent.state_seq,
-            cycle.how.seq,
+    rows = [
+        (
+            sent.run, sent.state_seq, how.seq, sent.decided_at_s, sent.u, one.u, how.fallback,
+            one.level, how.cost, one.how.cost if one.how else -1.0, not one.cycle.unknown,
         )
-        row["time_s"] = cycle.sent.decided_at_s
-        row["recorded"], row["u"] = cycle.sent.u, one.u
-        row["recorded_level"], row["level"] = cycle.how.fallback, one.level
-        row["recorded_cost"], row["cost"] = cycle.how.cost, -1.0 if how is None else how.cost
-        row["known"] = not cycle.unknown
-    return rows
+        for one in found
+        for sent, how in ((one.cycle.sent, one.cycle.how),)
+    ]  # fmt: skip
+    return np.array(rows, ROWS)
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +59,7 @@ class Replayed:
     """The first cycle whose input is another, and why; empty: there is none."""
     seconds: float
 
-    def checks(self, allowed: Tolerance | None) -> list[Check]:
+    def checks(self, allowed: Tolerance) -> list[Check]:
         """``allowed`` None: to the bit by the recorded controller; of another what it drives is
         reported, and that it needs the fallback no more often is checked."""
         rows = self.rows
@@ -95,7 +75,7 @@ class Replayed:
             checks.append(Check(self.name, named, now <= before and len(rows) > 0, self.quality))
         return checks
 
-    def against(self, baseline: NDArray[Any], allowed: Tolerance | None) -> Check:
+    def against(self, baseline: NDArray[Any], allowed: Tolerance) -> Check:
         """That the inputs are those of another replay, or recording, of the same states."""
         keys = ["run", "state_seq", "seq"]
         places = {tuple(key): at for at, key in enumerate(baseline[keys].tolist())}
@@ -104,10 +84,8 @@ class Replayed:
         theirs = baseline["u"][[places[key] for key in rows[keys].tolist()]]
         return self._check("inputs as the baseline's", rows, theirs.reshape(-1, 2), allowed)
 
-    def _check(
-        self, what: str, rows: NDArray[Any], wanted: Floats, allowed: Tolerance | None
-    ) -> Check:
-        bounds = np.array(allowed or (0.0, 0.0))
+    def _check(self, what: str, rows: NDArray[Any], wanted: Floats, allowed: Tolerance) -> Check:
+        bounds = _most(allowed)
         within: Flags = np.all(np.abs(rows["u"] - wanted) <= bounds, axis=1)
         bound = " to the bit" if not bounds.any() else f" within {_numbers(bounds)}"
         found = f"{int(within.sum())} of {len(within)} cycles"
@@ -143,6 +121,10 @@ class Replayed:
         return text
 
 
+def _most(allowed: Tolerance) -> Floats:
+    return np.array([(allowed or {}).get(name, 0.0) for name in INPUTS])
+
+
 def _numbers(values: Any) -> str:
     return ", ".join(f"{name} {value:.2g}" for name, value in zip(INPUTS, values, strict=True))
 
@@ -157,9 +139,9 @@ def _levels(levels: NDArray[Any]) -> str:
     return "/".join(str(int((levels == one).sum())) for one in range(4))
 
 
-def parting(found: Sequence[Answer], car: Car, allowed: Tolerance | None, known: bool) -> str:
+def parting(found: Sequence[Answer], car: Car, allowed: Tolerance, known: bool) -> str:
     """The first cycle whose input is not the recorded one, and what else differs there."""
-    bounds = np.array(allowed or (0.0, 0.0))
+    bounds = _most(allowed)
     for at, one in enumerate(found):
         if known and one.cycle.unknown:
             continue

@@ -13,13 +13,13 @@ from bayesrace.operation.report.style import (
     figure_style,
     write_png,
 )
-from bayesrace.studies.evidence.replay.comparison import INPUTS, Replayed
+from bayesrace.studies.evidence.inputs import INPUTS, UNITS
+from bayesrace.studies.evidence.replay.comparison import Replayed
 
 __all__ = ["draw"]
 
 _LEAST: Final = 1e-18
 """Drawn in place of a difference of 0, which has no logarithm."""
-_UNITS: Final = ("", " [rad/s]")
 
 
 def draw(replayed: Replayed, path: Path) -> None:
@@ -37,7 +37,7 @@ def draw(replayed: Replayed, path: Path) -> None:
             inputs, differences = axes[2 * i], axes[2 * i + 1]
             inputs.plot(time_s, rows["recorded"][:, i], color=INK, label="recorded")
             inputs.plot(time_s, rows["u"][:, i], color="#0072B2", ls="--", label="replayed")
-            inputs.set_ylabel(name + _UNITS[i])
+            inputs.set_ylabel(name + UNITS[i])
             differences.semilogy(time_s, np.maximum(apart[:, i], _LEAST), color=WARNING)
             differences.set_ylabel("difference")
             differences.set_ylim(_LEAST / 2, 10)

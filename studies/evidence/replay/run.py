@@ -37,13 +37,13 @@ def replay(
     logs: Sequence[Path],
     given: Given,
     stages: Stages,
-    allowed: Tolerance | None = None,
+    allowed: Tolerance = None,
     against: Path | None = None,
     out: Path | None = None,
 ) -> Verdict:
     """Replays each drive and compares its inputs with those recorded, or with those ``against``.
 
-    ``allowed``: the largest differences; None: to the bit, where the recorded controller answers.
+    ``allowed`` None: to the bit, where the recorded controller answers.
     ``out`` gets result.json, and the inputs and a picture of each drive. InputError for a drive
     that cannot be replayed.
     """
@@ -96,9 +96,7 @@ def _logs_in(given: Path) -> Iterator[tuple[str, Path]]:
         yield named.relative_to(given).as_posix(), path
 
 
-def _each(
-    drives: Mapping[str, Path], given: Given, allowed: Tolerance | None
-) -> Iterator[Replayed]:
+def _each(drives: Mapping[str, Path], given: Given, allowed: Tolerance) -> Iterator[Replayed]:
     """In order; several of them by as many processes as there are cores."""
     workers = min(len(drives), len(os.sched_getaffinity(0)))
     if workers == 1:
@@ -114,7 +112,7 @@ def _each(
             pool.shutdown(cancel_futures=True)
 
 
-def _one(name: str, path: Path, given: Given, allowed: Tolerance | None) -> Replayed:
+def _one(name: str, path: Path, given: Given, allowed: Tolerance) -> Replayed:
     begin_s = time.monotonic()
     every: list[Answer] = []
     same, cycles, said = True, 0, ""

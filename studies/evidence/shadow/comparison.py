@@ -8,12 +8,12 @@ from pydantic import BaseModel, ConfigDict, Field
 from scipy.interpolate import CubicHermiteSpline
 
 from bayesrace.arrays import Flags, Floats
+from bayesrace.studies.evidence.inputs import INPUTS
 from bayesrace.studies.evidence.shadow.cycles import Beside, Side
 from bayesrace.tracks import Track
 
-__all__ = ["INPUTS", "Compared", "Place", "Promise", "Spread", "apart", "compare", "plan_errors"]
+__all__ = ["Compared", "Place", "Promise", "Spread", "apart", "compare", "plan_errors"]
 
-INPUTS: Final = "d", "delta_rate"
 _ALIKE: Final = 0.02, 0.2
 """Inputs that differ by no more (d, delta_rate [rad/s]) bring about nearly the same."""
 _HORIZONS_S: Final = 0.1, 0.2, 0.4

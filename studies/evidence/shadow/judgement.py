@@ -10,20 +10,19 @@ from rich.console import Console
 from bayesrace.controller.settings import GateSettings
 from bayesrace.controller.weights.checks import compare as compare_errors
 from bayesrace.controller.weights.checks import slack_of
-from bayesrace.errors import InputError
 from bayesrace.files import write_whole
 from bayesrace.gp.weights import OUTPUTS, Weights
 from bayesrace.learning.validation import discretisation_of
 from bayesrace.operation.analysis.validation import validate_weights
 from bayesrace.operation.terminal.terminal import plain_table
-from bayesrace.studies.evidence.shadow.comparison import INPUTS, Compared, compare
+from bayesrace.studies.evidence.shadow.comparison import Compared, compare
 from bayesrace.studies.evidence.shadow.cycles import read_cycles
 from bayesrace.studies.evidence.shadow.picture import draw
 from bayesrace.studies.evidence.verdict import Check, Verdict
 from bayesrace.tracks import Track
 from bayesrace.vehicles import Car, get_car
 
-__all__ = ["bounds", "judge_shadows"]
+__all__ = ["judge_shadows"]
 
 _ANSWERED: Final = 0.99
 _FEWER_SOLUTIONS: Final = 0.01
@@ -32,20 +31,6 @@ _WORSE, _WORSE_M = 1.2, 0.001
 """Factor on the plan's error of the controller that drives, and beyond it [m]."""
 _LEAST_PLANS: Final = 20
 _JUDGED_S: Final = 0.2
-
-
-def bounds(text: str) -> dict[str, float]:
-    """Bounds by input from ``d=0.1,delta_rate=1``; InputError for anything else."""
-    found: dict[str, float] = {}
-    for part in filter(None, text.split(",")):
-        name, _, number = part.partition("=")
-        try:
-            found[name.strip()] = float(number)
-        except ValueError:
-            found[""] = 0.0
-    if found.keys() - set(INPUTS) or not all(value >= 0 for value in found.values()):
-        raise InputError(f"--at-most {text}: give d, delta_rate or both, as d=0.1,delta_rate=1")
-    return found
 
 
 def judge_shadows(

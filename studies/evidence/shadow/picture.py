@@ -8,13 +8,13 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from bayesrace.operation.report.style import INK, PICTURE_WIDTH, WARNING, figure_style, write_png
-from bayesrace.studies.evidence.shadow.comparison import INPUTS, apart, plan_errors
+from bayesrace.studies.evidence.inputs import INPUTS, UNITS
+from bayesrace.studies.evidence.shadow.comparison import apart, plan_errors
 from bayesrace.studies.evidence.shadow.cycles import Beside
 
 __all__ = ["draw"]
 
 _AFTER_S: Final = np.arange(0.02, 0.41, 0.02)
-_UNITS: Final = "", " [rad/s]"
 
 
 def draw(one: Beside, title: str, path: Path) -> None:
@@ -22,7 +22,7 @@ def draw(one: Beside, title: str, path: Path) -> None:
     with figure_style():
         figure = Figure((PICTURE_WIDTH, 3.6), layout="constrained")
         *maps, plans = figure.subplots(1, 3, width_ratios=(1, 1, 0.9))
-        for axes, differences, name, unit in zip(maps, apart(one).T, INPUTS, _UNITS, strict=True):
+        for axes, differences, name, unit in zip(maps, apart(one).T, INPUTS, UNITS, strict=True):
             axes.plot(one.came[:, 0], one.came[:, 1], color="#d0d0ca", lw=0.6, zorder=1)
             order = np.argsort(differences)  # the largest on top
             x, y = one.x[order, :2].T

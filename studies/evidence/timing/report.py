@@ -29,7 +29,7 @@ _COLOURS: Final = dict(
 
 
 def print_study(study: Study, console: Console) -> None:
-    """A row for each phase, the hardest starts, the verdict, the statement."""
+    """A row for each phase, the hardest starts, the statement."""
     result = study.result
     table = plain_table("phase [ms]", "p50", "p99", "p99.9", "max", "level", padding=0)
     for one in result.times:
@@ -44,7 +44,6 @@ def print_study(study: Study, console: Console) -> None:
     if result.counter:
         console.print(Text(f"No counter of instructions here ({result.counter}): the search climbs "
                            "by iterations times QP steps."))  # fmt: skip
-    study.verdict.print(console)
     console.print(Text(result.statement))
 
 
