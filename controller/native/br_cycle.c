@@ -562,8 +562,9 @@ int br_cycle_get_refusals(const br_cycle *cycle, int refused[BR_REFUSALS]) {
 
 br_mpc_error br_cycle_repeat(br_cycle *cycle, const int *refused, int count) {
     if (!cycle) return BR_ERROR_NULL;
-    cycle->repeats = 1;
-    return cycle->mpc ? br_mpc_repeat(cycle->mpc, refused, count) : BR_OK;
+    const br_mpc_error error = cycle->mpc ? br_mpc_repeat(cycle->mpc, refused, count) : BR_OK;
+    cycle->repeats = !error;
+    return error;
 }
 
 br_mpc_error br_cycle_brake(const br_cycle *cycle, br_braking *braking) {
@@ -581,7 +582,9 @@ br_mpc_error br_cycle_brake(const br_cycle *cycle, br_braking *braking) {
 
 /* A car is being driven: a step has been made, and no halt since. */
 void br_cycle_prepare(br_cycle *cycle, double period_s, double budget_s) {
-    if (!cycle || !cycle->stepped) return;
+    if (!cycle) return;
+    cycle->repeats = 0;
+    if (!cycle->stepped) return;
     if (cycle->stream.newest.estimated) foresee(cycle); /* by the last step's mismatch */
     cycle->controller.prepare(cycle->controller.self, period_s, budget_s);
 }
