@@ -36,6 +36,7 @@ from bayesrace.operation.settings import PreparationSettings
 from bayesrace.operation.simulation import Link, SimulatedSystem
 from bayesrace.operation.terminal.terminal import Stages
 from bayesrace.plant.process_settings import PlantSettings
+from bayesrace.transport.relay import AGAIN
 from benchmarks.harness import Row, arguments, report
 
 _DELAYS_MS = (0, 5, 10, 20, 30, 40, 60)
@@ -66,7 +67,7 @@ class Case(NamedTuple):
     @property
     def buffer_ms(self) -> float:
         """As advised."""
-        again = 4 if self.ordered and self.loss else 0
+        again = AGAIN if self.ordered and self.loss else 0
         return (2 + again) * self.delay_ms + self.jitter_ms + 5 if self.buffered else 0.0
 
 

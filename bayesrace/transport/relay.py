@@ -18,9 +18,9 @@ from typing import Final
 
 from bayesrace.transport.endpoints import address_of, free_endpoint
 
-__all__ = ["Relay"]
+__all__ = ["AGAIN", "Relay"]
 
-_AGAIN: Final = 4
+AGAIN: Final = 4
 """After so many times the delay, two round trips, TCP sends again what was lost."""
 _DATAGRAM: Final = 1 << 16
 
@@ -221,7 +221,7 @@ class Relay:
             with suppress(OSError):
                 while data := receive():
                     lost, delay_s = way.draw()
-                    delay_s += _AGAIN * way.delay_s if lost else 0.0
+                    delay_s += AGAIN * way.delay_s if lost else 0.0
                     due_s = max(due_s, time.monotonic() + delay_s)
                     waiting.put((due_s, data))
             waiting.put((0.0, b""))

@@ -15,11 +15,9 @@ import zenoh
 
 from bayesrace.operation.simulation.scheduler import Scheduler
 from bayesrace.transport import NEWEST
+from bayesrace.transport.relay import AGAIN
 
 __all__ = ["IDEAL", "Direction", "Link", "Network", "Session"]
-
-_AGAIN: Final = 4
-"""After so many times the delay, two round trips, TCP sends again what was lost."""
 
 
 class Link(NamedTuple):
@@ -57,7 +55,7 @@ class Direction:
             self.lost += not lost
             return
         way_s = link.delay_s + self._random.uniform(-link.jitter_s, link.jitter_s)
-        way_s += _AGAIN * link.delay_s if lost else 0.0
+        way_s += AGAIN * link.delay_s if lost else 0.0
         arrives_ns = now_ns + max(round(way_s * 1e9), 0)
         if link.ordered:
             arrives_ns = self._free_ns = max(self._free_ns, arrives_ns)
