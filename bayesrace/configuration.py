@@ -10,13 +10,14 @@ import json
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Final, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from bayesrace.defaults import CONFIGURATION_VARIABLE
 from bayesrace.errors import InputError, faults_in
 from bayesrace.files import parse_toml, read_text
+from bayesrace.log_parts import LogSize
 from bayesrace.messages import Role
 from bayesrace.realtime import RealtimeSettings
 from bayesrace.transport.credentials import CERTIFICATE, COVERS, MEMBERS, Credentials
@@ -34,6 +35,8 @@ __all__ = [
     "Configuration", "DriveSettings", "NetworkSettings", "TlsSettings", "as_toml", "configured",
     "read_configuration",
 ]  # fmt: skip
+
+_LISTENERS: Final = "plant", "controller", "shadow", "router"
 
 
 class _Section(BaseModel):
@@ -61,6 +64,9 @@ class NetworkSettings(_Section):
     controller: tuple[Endpoint, ...] = Field(
         (CONTROLLER_ENDPOINT,), description="where the controller listens, and the others find it"
     )
+    shadow: tuple[Endpoint, ...] = Field(
+        (), description="without a router: where a shadow listens, and directors find it"
+    )
     router: tuple[Endpoint, ...] = Field(
         (), description="where the router listens, and all others find it"
     )
@@ -81,7 +87,7 @@ class NetworkSettings(_Section):
 
     def check(self) -> None:
         """InputError if two processes are to listen at one endpoint; by a router, only it does."""
-        listening = ("router",) if self.by_router else ("plant", "controller", "router")
+        listening = ("router",) if self.by_router else _LISTENERS
         where = [(one, name) for name in listening for one in getattr(self, name)]
         for (one, name), (other, second) in itertools.combinations(where, 2):
             if _port(one) == _port(other):
@@ -94,13 +100,13 @@ class NetworkSettings(_Section):
 
     def listens(self, role: Role) -> tuple[str, ...]:
         """Where a process in that role listens; by a router, only it does."""
-        own = {"plant": self.plant, "controller": self.controller, "router": self.router}
-        return own.get(role, ()) if role == "router" or not self.by_router else ()
+        own = getattr(self, role) if role in _LISTENERS else ()
+        return own if role == "router" or not self.by_router else ()
 
     @property
     def everyone(self) -> tuple[str, ...]:
         """Endpoints by which every process is reached."""
-        return self.router if self.by_router else (*self.plant, *self.controller)
+        return self.router if self.by_router else (*self.plant, *self.controller, *self.shadow)
 
 
 class TlsSettings(_Section):
@@ -136,6 +142,11 @@ class DriveSettings(_Section):
         False,
         description="dead man's switch: 'drive' holds its runs, the plant refuses those of others",
     )
+    max_log: LogSize | None = Field(
+        None,
+        description="size of the log that 'drive' writes at most, as \"500MB\": it goes on in new "
+        "files, and the oldest are deleted; not set: no limit",
+    )
 
 
 class Configuration(_Section):
@@ -160,7 +171,9 @@ class Configuration(_Section):
     ) -> Endpoints:
         """Where a process in that role listens and connects; what is given overrides the file."""
         network = self.network
-        own: dict[Role, tuple[str, ...]] = {"plant": (), "controller": network.plant}
+        driven = (*network.plant, *network.controller)
+        own: dict[Role, tuple[str, ...]]
+        own = {"plant": (), "controller": network.plant, "shadow": driven}
         connects = network.everyone if network.by_router else own.get(role, network.everyone)
         return Endpoints(
             listen=tuple(listen or network.listens(role)),

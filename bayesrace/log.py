@@ -7,11 +7,12 @@ the file ends without its index.
 """
 
 import json
+import os
 import struct
 import time
 from collections import deque
 from collections.abc import Callable, Collection, Iterator, Mapping
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import IO, Any, Final, Generic, NamedTuple, TypeVar, cast
@@ -25,6 +26,7 @@ from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import Writer
 
 from bayesrace.errors import InputError
+from bayesrace.log_parts import PART, part_files, part_path
 from bayesrace.messages import (
     TOPICS,
     Actuation,
@@ -63,14 +65,16 @@ class _CarClock:
 
     def __init__(self) -> None:
         self._run: tuple[int, int] | None = None
-        self._begin_ns = self._newest_ns = self._decided_ns = 0
+        self._begin_ns = self._newest_ns = 0
+        self._decided_ns: dict[str, int] = {}
 
-    def time_ns(self, message: Message | None, wall_ns: int) -> int:
+    def time_ns(self, message: Message | None, wall_ns: int, sender: str) -> int:
         """Of a state its own time, of actuation and telemetry that of the decision; of all else the
-        newest state's. ``wall_ns``: calendar time of its arrival."""
+        newest state's. ``wall_ns``: calendar time of its arrival; ``sender``: what the keys of a
+        controller, or of a shadow, have in common."""
         self._newest_ns = self._newest_ns or wall_ns
         if isinstance(message, Telemetry):  # follows its actuation, from the same process
-            return self._decided_ns or self._newest_ns
+            return self._decided_ns.get(sender, self._newest_ns)
         if not isinstance(message, State | Actuation):
             return self._newest_ns
         run = message.epoch, message.run
@@ -79,8 +83,8 @@ class _CarClock:
         time_ns = self._begin_ns + own_ns
         goes_on = run == self._run and abs(time_ns - self._newest_ns) <= _LONGEST_GAP_NS
         if isinstance(message, Actuation):  # it can overtake the first state of a run
-            self._decided_ns = time_ns if goes_on else self._newest_ns
-            return self._decided_ns
+            self._decided_ns[sender] = time_ns if goes_on else self._newest_ns
+            return self._decided_ns[sender]
         if not goes_on:
             time_ns = self._newest_ns if message.lockstep else max(self._newest_ns, wall_ns)
             self._run, self._begin_ns = run, time_ns - own_ns
@@ -96,7 +100,14 @@ class LogWriter:
     encoding ``msgpack`` and no schema.
     """
 
-    def __init__(self, path: Path, metadata: Mapping[str, Mapping[str, str]] | None = None) -> None:
+    def __init__(
+        self,
+        path: Path,
+        metadata: Mapping[str, Mapping[str, str]] | None = None,
+        clock: _CarClock | None = None,
+    ) -> None:
+        """``clock``: that of the log which this one continues."""
+        self.path = path
         try:
             self._file = path.open("wb")
         except OSError as error:
@@ -107,10 +118,15 @@ class LogWriter:
         self._schemas: dict[str, int] = {}
         # MCAP tools show calendar time; intervals stay those of the monotonic clock.
         self._epoch_ns = time.time_ns() - time.monotonic_ns()
-        self._clock = _CarClock()
+        self.clock = clock or _CarClock()
         for name, values in (metadata or {}).items():
             self.add_metadata(name, values)
         self.flush()
+
+    @property
+    def size_bytes(self) -> int:
+        """Of the file, without the chunk that is not ended yet."""
+        return self._file.tell()
 
     def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
         """A named map of texts, such as the settings or the manifest."""
@@ -130,7 +146,7 @@ class LogWriter:
             schema = 0 if message is None else self._schema(type(message))
             self._channels[place] = self._writer.register_channel(key, encoding, schema)
         wall_ns = self._epoch_ns + received_ns
-        time_ns = self._clock.time_ns(message, wall_ns)
+        time_ns = self.clock.time_ns(message, wall_ns, key.rpartition("/")[0])
         seq = None if message is None else message.seq
         content = data if message is None else to_json(message)
         number = 0 if seq is None else seq & 0xFFFFFFFF
@@ -181,49 +197,76 @@ class _Channel(NamedTuple):
 class _Place:
     """How far a log has been read, and what has been found on the way there."""
 
+    number: int = 0
+    """Of the part (:mod:`bayesrace.log_parts`) ..."""
     offset: int = 0
+    """... and within it."""
     unpacked: int = 0
-    """Bytes of all whole chunks."""
+    """Bytes of its whole chunks."""
+    repeated: int = 0
+    """Messages at its beginning that are still to be left out."""
     pending: deque[Any] = field(default_factory=deque)
     """Records of the last chunk that have not been taken yet."""
     ended: bool = False
-    """The end mark has been read."""
+    """The end mark of the part has been read."""
     channels: dict[int, _Channel] = field(default_factory=dict)
     refused: int = 0
     """Messages that could not be decoded."""
+
+    def move_to(self, number: int, repeated: int) -> None:
+        """To the beginning of another part."""
+        self.number, self.repeated = number, repeated
+        self.offset = self.unpacked = 0
+        self.ended = False
 
 
 class LogReader:
     """Reads a log in order of arrival, also one that was cut off, or is being written.
 
+    A recording in parts is one log: they are read in order, from the oldest one that is there.
     After an iteration, ``refused`` and ``last_reason`` say what could not be decoded on its way
-    from the beginning of the log, and ``truncated`` whether the file ends without its end mark.
+    from the beginning of the log, and ``truncated`` whether a file ends without its end mark.
     """
 
     def __init__(self, path: Path) -> None:
-        if not path.is_file():
+        """``path``: of the log; of a recording in parts, of the first one, though it be deleted, or
+        of the one to be read alone."""
+        if not (parts := part_files(path)):
             raise InputError(f"no log at {path}")
         self.path = path
         self.refused = 0
         self.last_reason = ""
         self.truncated = False
-        self._place = _Place()
+        self._first = next(iter(parts))
+        self.part = self._about(self._first)
+        """Which recording it is a part of, as the file says where reading begins; else empty."""
+        self._place = self._begin()
+
+    @property
+    def parts_gone(self) -> int:
+        """Parts of the recording before the first message that is read."""
+        return _count(self.part.get("number", ""))
+
+    def _begin(self) -> _Place:
+        return _Place(self._first)
 
     def metadata(self) -> dict[str, dict[str, str]]:
         """Name to map of texts; the last of one name wins."""
-        found = (record for record in self._records(_Place()) if isinstance(record, Metadata))
+        everything = self._records(self._begin())
+        found = (record for record in everything if isinstance(record, Metadata))
         return {record.name: dict(record.metadata) for record in found}
 
     def channels(self) -> set[str]:
         """The keys that it holds messages of."""
-        return {record.topic for record in self._records(_Place()) if isinstance(record, Channel)}
+        everything = self._records(self._begin())
+        return {record.topic for record in everything if isinstance(record, Channel)}
 
     def messages(self, topics: Collection[Topic[Any]] = TOPICS) -> Iterator[Entry[Any]]:
         """The messages of these topics, typed; those that cannot be decoded are counted.
 
         They are read from the beginning, whatever :meth:`newer` has returned.
         """
-        return self._entries(_Place(), topics)
+        return self._entries(self._begin(), topics)
 
     def newer(self, topics: Collection[Topic[Any]] = TOPICS) -> Iterator[Entry[Any]]:
         """The messages of these topics in what has been added to the log since the last call.
@@ -239,6 +282,7 @@ class LogReader:
         for record in self._records(place):
             if isinstance(record, Channel):
                 topic = topic_of(record.topic)
+                wanted.pop(record.id, None)  # the number of another key in the part before
                 if topic is None:
                     continue
                 form = decode_json if record.message_encoding == "json" else decode
@@ -261,16 +305,57 @@ class LogReader:
         return [entry.message for entry in self.messages((topic,))]
 
     def _records(self, place: _Place) -> Iterator[Any]:
-        """What follows that place, which moves on with each whole record or chunk."""
+        """What follows that place, which moves on with each whole record or chunk, and from part
+        to part."""
         self.truncated = False
+        while True:
+            # Looked for first: if there is a later part, no more is written to this one.
+            later = self._later(place.number)
+            for record in self._of_part(place):
+                if place.repeated and isinstance(record, Record):
+                    place.repeated -= 1
+                    continue
+                yield record
+            if later is None:
+                return
+            number, repeated = later
+            went_on = place.offset > 0 and number == place.number + 1
+            place.move_to(number, repeated if went_on else 0)
+
+    def _later(self, number: int) -> tuple[int, int] | None:
+        """The next part of the same recording that is there, and how many messages it repeats;
+        None while its beginning is not written."""
+        if not self.part:
+            return None
+        for other in part_files(self.path):
+            about = self._about(other) if other > number else {}
+            if about and about.get("recording") == self.part.get("recording"):
+                return other, _count(about.get("repeated", ""))
+        return None
+
+    def _about(self, number: int) -> dict[str, str]:
+        """The metadata ``part`` of a file, which come before its messages; empty without."""
+        with suppress(InputError):
+            for record in self._of_part(_Place(number)):
+                if isinstance(record, Metadata) and record.name == PART:
+                    return dict(record.metadata)
+                if isinstance(record, Channel | Record):
+                    break
+        return {}
+
+    def _of_part(self, place: _Place) -> Iterator[Any]:
+        """What follows that place in its part; nothing where that is deleted meanwhile."""
+        path = part_path(self.path, place.number)
         while place.pending:
             yield place.pending.popleft()
         if place.ended:
             return
-        with self.path.open("rb") as file:
+        with _opened(path) as file:
+            if file is None:
+                return
             head = file.read(len(_MCAP_MAGIC))
             if not _MCAP_MAGIC.startswith(head):
-                raise InputError(f"{self.path} is not an MCAP log; give the log of a run")
+                raise InputError(f"{path} is not an MCAP log; give the log of a run")
             file.seek(place.offset)
             reader = StreamReader(
                 cast(Any, _Whole(file)),
@@ -280,7 +365,7 @@ class LogReader:
             )
             try:
                 for record in reader.records:
-                    place.pending.extend(self._parts(record, place))
+                    place.pending.extend(self._contained(record, place, file))
                     # Not beyond the footer: the end mark behind it may not be written yet.
                     if not isinstance(record, Footer):
                         place.offset = file.tell()
@@ -292,16 +377,33 @@ class LogReader:
             except _DAMAGED:
                 self.truncated = True
 
-    def _parts(self, record: Any, place: _Place) -> list[Any]:
+    def _contained(self, record: Any, place: _Place, file: IO[bytes]) -> list[Any]:
         """The records of a chunk, which are counted if it is whole; any other record itself."""
         if not isinstance(record, Chunk):
             return [record]
         total = place.unpacked + record.uncompressed_size
-        if total > _MOST_UNPACKED + _RATIO * self.path.stat().st_size:
-            raise InputError(f"{self.path} would unpack to many times its size: no log of a run")
+        if total > _MOST_UNPACKED + _RATIO * os.fstat(file.fileno()).st_size:
+            raise InputError(f"{file.name} would unpack to many times its size: no log of a run")
         records: list[Any] = breakup_chunk(_unpacked(record), validate_crc=True)
         place.unpacked = total
         return records
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[IO[bytes] | None]:
+    """A part for reading; None if it has been deleted."""
+    try:
+        file = path.open("rb")
+    except FileNotFoundError:
+        yield None
+        return
+    with file:
+        yield file
+
+
+def _count(text: str) -> int:
+    """A number in the metadata; 0 if it is none."""
+    return int(text) if text.isdecimal() and len(text) < 10 else 0
 
 
 def _unpacked(chunk: Chunk) -> Chunk:

@@ -1,5 +1,4 @@
-"""Sleeping to an absolute deadline of the monotonic clock, real-time priority, CPU affinity and
-memory locking. Wall-clock time is never used to measure: it jumps.
+"""Real-time priority, CPU affinity and memory locking.
 
 Refusals are reported, and the work goes on: most of it needs rights that few processes have.
 :func:`short_slices` needs none: threads of the transport that are started in it run as soon as a
@@ -15,23 +14,20 @@ import gc
 import os
 import platform
 import sys
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any, Final
+from typing import Final
 
 from pydantic import BaseModel, ConfigDict, Field
 
 __all__ = [
-    "SUSPENDED_S", "RealtimeSettings", "prepare_thread", "short_slices", "sleep_until_ns",
-    "suspension", "uncollected",
+    "SUSPENDED_S", "RealtimeSettings", "prepare_thread", "short_slices", "suspension",
+    "uncollected",
 ]  # fmt: skip
 
 SUSPENDED_S: Final = 1.0
 """A wait that ends so much later than it should: the process has not run."""
 
-_CLOCK_MONOTONIC: Final = 1
-_TIMER_ABSTIME: Final = 1
 _PR_SET_TIMERSLACK = 29
 _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
 
@@ -51,33 +47,6 @@ class RealtimeSettings(BaseModel):
         None, ge=1, le=99, description="SCHED_FIFO priority of the control thread"
     )
     lock_memory: bool = Field(False, description="lock the memory of the process against paging")
-
-
-class _Timespec(ctypes.Structure):
-    _fields_ = [("seconds", ctypes.c_long), ("nanoseconds", ctypes.c_long)]
-
-
-def _find_nanosleep() -> Any:
-    return ctypes.CDLL(None).clock_nanosleep if sys.platform.startswith("linux") else None
-
-
-_nanosleep: Final = _find_nanosleep()
-
-
-def sleep_until_ns(deadline_ns: int) -> None:
-    """Sleep until ``time.monotonic_ns()`` reaches the deadline; at once if it has passed.
-
-    Absolute where the system can (``clock_nanosleep``): a thread that is held up between reading
-    the clock and sleeping wakes in time all the same. A signal ends the sleep, as it must.
-    """
-    if _nanosleep is not None:
-        if deadline_ns > time.monotonic_ns():
-            until = _Timespec(*divmod(deadline_ns, 1_000_000_000))
-            _nanosleep(_CLOCK_MONOTONIC, _TIMER_ABSTIME, ctypes.byref(until), None)
-        return
-    left_ns = deadline_ns - time.monotonic_ns()
-    if left_ns > 0:
-        time.sleep(left_ns * 1e-9)
 
 
 def suspension(seconds: float) -> str:

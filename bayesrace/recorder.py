@@ -15,7 +15,7 @@ from typing import Any, Final, Self
 import zenoh
 
 from bayesrace.errors import InputError
-from bayesrace.log import LogWriter
+from bayesrace.log_rotation import RotatingLog
 from bayesrace.messages import (
     EVENT,
     EVERYTHING,
@@ -54,6 +54,8 @@ class RecorderCounters:
     """What is not a message of its key's topic; it is written all the same."""
     unrecorded: int = 0
     """Messages that are not written, since they came on too many keys that are not in the table."""
+    parts_deleted: int = 0
+    """Parts of the log that were deleted, the oldest first, to keep within its size."""
 
 
 class Recorder:
@@ -71,7 +73,10 @@ class Recorder:
         car: str,
         path: Path,
         metadata: Mapping[str, Mapping[str, str]] | None = None,
+        most_bytes: int | None = None,
     ) -> None:
+        """``most_bytes``: size of the log at most, of which the newest part is kept; None: no
+        limit."""
         self.counters = RecorderCounters()
         self.failed = ""
         """Why the log cannot be written; empty while it can. Later messages are not written."""
@@ -81,7 +86,7 @@ class Recorder:
         self._other_keys: set[str] = set()
         self._path, self._session = path, session
         self._event_key = car_key(EVENT.key, car, "recorder")
-        self._writer = LogWriter(path, metadata)
+        self._writer = RotatingLog(path, metadata, most_bytes)
         self._lock = threading.Lock()
         self._subscriber = session.declare_subscriber(
             car_key(EVERYTHING, car), zenoh.handlers.FifoChannel(_CHANNEL_CAPACITY)
@@ -206,7 +211,7 @@ class Recorder:
             with self._lock:
                 self._writer.flush()
             # Writing to a deleted file succeeds, but its content is lost.
-            self._path.stat()
+            self._writer.path.stat()
         except (OSError, ValueError) as error:
             self._fail(error)
 
@@ -217,6 +222,7 @@ class Recorder:
     def _count(self, key: str, seq: int | None) -> None:
         counters = self.counters
         counters.written += 1
+        counters.parts_deleted = self._writer.deleted
         if seq is None:
             counters.unnumbered += 1
             return

@@ -74,9 +74,17 @@ MEASUREMENTS: Final = {
         "bayesrace latency --rate 500 --json {out}/latency.json", "latency.json",
         (*_STEP, "controller", "plant"),
     ),
+    "timing": Measurement("bayesrace timing --at-most 1000 --out {out}", "timing.json", _STEP),
+    "timing40": Measurement(
+        "bayesrace timing --horizon 40 --at-most 1000 --out {out}", "timing.json", _STEP
+    ),
     "interface": Measurement(
         "python -m benchmarks.interface --json {out}/interface.json", "interface.json",
         (*_STEP, "controller", "plant", "operation/closed_loop.py", "benchmarks/interface.py"),
+    ),
+    "long_runs": Measurement(
+        "python -m benchmarks.long_runs --out {out} --json {out}/long.json", "long.json",
+        (*_STEP, "controller", "plant", "operation/drive.py", "benchmarks/long_runs.py"),
     ),
     "paper": Measurement(
         "bayesrace paper --tracks {tracks} --data {data} --out {out}", "numbers.json",

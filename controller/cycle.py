@@ -6,13 +6,13 @@
 """
 
 import math
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
 
+from bayesrace import clock
 from bayesrace.arrays import Floats
 from bayesrace.controller.driver import Decision, Driver
 from bayesrace.controller.interface import NO_PLAN, Controller, Environment, StepOutput
@@ -39,6 +39,8 @@ class Timing:
     wake_us: float = 0.0
     decode_us: float = 0.0
     prepare_us: float = 0.0
+    prepared_s: float = 0.0
+    prepared_refused: tuple[int, ...] = ()
     solve_us: float = 0.0
     encode_us: float = 0.0
     ticks: int = 0
@@ -66,6 +68,7 @@ class Cycle:
         self.driver = Driver(controller, car, settings)
         self.timing = Timing()
         self._controller = controller
+        self._reported = 0
 
     def answer(
         self,
@@ -74,7 +77,7 @@ class Cycle:
         environment: Environment | None = None,
     ) -> None:
         """Answers a state of a lockstep run, then prepares for the next one."""
-        self.timing.released_ns = time.monotonic_ns()
+        self.timing.released_ns = clock.monotonic_ns()
         send(state, self.decide(state.time_s, environment=environment))
         self.prepare(self.driver.interval_s, 0.0)
 
@@ -86,22 +89,25 @@ class Cycle:
         environment: Environment | None = None,
     ) -> Decision:
         """:meth:`Driver.decide`, timed."""
-        begin_ns = time.perf_counter_ns()
+        begin_ns = clock.perf_counter_ns()
         decision = self.driver.decide(decided_at_s, budget_s, spent_s, environment)
-        self.timing.solve_us = (time.perf_counter_ns() - begin_ns) * 1e-3
+        self.timing.solve_us = (clock.perf_counter_ns() - begin_ns) * 1e-3
         return decision
 
     def prepare(self, period_s: float, budget_s: float) -> None:
         """:meth:`Driver.prepare`, timed."""
-        begin_ns = time.perf_counter_ns()
+        begin_ns = clock.perf_counter_ns()
         self.driver.prepare(period_s, budget_s)
-        self.timing.prepare_us = (time.perf_counter_ns() - begin_ns) * 1e-3
+        timing = self.timing
+        timing.prepare_us = (clock.perf_counter_ns() - begin_ns) * 1e-3
+        timing.prepared_s = period_s
+        timing.prepared_refused = self.driver.refusals if budget_s > 0 else ()
 
     def actuation(self, seq: int, state: State, decision: Decision) -> Actuation:
         """The message that answers ``state``."""
         return Actuation(
             seq=seq,
-            source_time_ns=time.monotonic_ns(),
+            source_time_ns=clock.monotonic_ns(),
             epoch=state.epoch,
             run=state.run,
             state_seq=state.seq,
@@ -118,10 +124,13 @@ class Cycle:
         timing.received_ns = received_ns
         output = self.driver.output or _NO_OUTPUT
         estimate, deviation = self._estimate()
+        states, self._reported = self.driver.taken - self._reported, self.driver.taken
+        prepared_s, prepared_refused = timing.prepared_s, timing.prepared_refused
+        timing.prepared_s, timing.prepared_refused = 0.0, ()
         numbers = {"cost": output.cost, "cost_shifted": output.cost_shifted, **output.numbers}
         return Telemetry(
             seq=seq,
-            source_time_ns=time.monotonic_ns(),
+            source_time_ns=clock.monotonic_ns(),
             run=state.run,
             state_seq=state.seq,
             status=decision.status,
@@ -143,6 +152,11 @@ class Cycle:
             second_start=output.second_start,
             estimate=estimate,
             deviation=deviation,
+            states=states,
+            late_s=max(decision.late_s, 0.0),
+            refused=decision.refused,
+            prepared_s=prepared_s,
+            prepared_refused=prepared_refused,
             **{name: _known(numbers.get(name, none), none) for name, none in NOT_REPORTED.items()},
         )
 

@@ -5,12 +5,12 @@ count, stop and go, delay compensation, the step, the fallback. Times are the pl
 say otherwise, so lockstep and free-running mode are the same here.
 """
 
-import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import IntEnum, StrEnum
 from typing import Any, Final
 
+from bayesrace import clock
 from bayesrace.controller.estimator import Belief, Measurement, fill, read
 from bayesrace.controller.interface import Controller, Environment, StepOutput
 from bayesrace.controller.native_step import Status
@@ -78,6 +78,10 @@ class Decision:
     """Execution time of the step."""
     fault: int = 0
     """What speaks against the state: a number of :data:`bayesrace.messages.SENSOR_FAULTS`."""
+    late_s: float = 0.0
+    """How much later than its budget it was made; not above 0: in time."""
+    refused: tuple[int, ...] = ()
+    """Where the step's time ran out: :attr:`Driver.refusals`."""
     stepped: bool = False
     """Whether a step was made; :attr:`Driver.output` has its results."""
 
@@ -100,8 +104,9 @@ class Driver:
         limits = {"u_low": (car.d_min, -rate), "u_high": (car.d_max, rate)}
         driving = ffi.new("br_driving *", settings.cycle_values(car) | limits)
         artefact.check(library.br_cycle_set_driving(self._cycle, driving), "cycle settings")
-        clock = ffi.addressof(library, "br_mpc_monotonic")
-        library.br_cycle_set_clock(self._cycle, clock, ffi.NULL)
+        library.br_cycle_set_clock(
+            self._cycle, ffi.addressof(library, "br_mpc_monotonic"), ffi.NULL
+        )
         self._counters = library.br_cycle_counters(self._cycle)
         self._measured = ffi.new("br_measured *")
         self._measured.averaged = 1
@@ -113,6 +118,7 @@ class Driver:
             nominal.set_values(MpcSettings().parameters(car, nominal.manifest.problem.name))
         self._by_weights = bool(controller.weights_version)
         self.estimate(self._tuning.estimation(nominal=not self._by_weights))
+        self._refusals = ffi.new("int[]", library.BR_REFUSALS)
         self._refused: State | None = None
         self.last_error = ""
         """Of the last step that was broken; empty if none was."""
@@ -124,6 +130,8 @@ class Driver:
         """What the newest state is estimated to be; None: it is measured, or nothing is known."""
         self.numbering = Numbering()
         """States received and lost, foreign ones left out."""
+        self.taken = 0
+        """States that count, so far."""
         self.readings_left_out = 0
         """Readings of more instruments than the estimator has room for."""
 
@@ -199,6 +207,12 @@ class Driver:
         if self.decision.status in (Status.HALTED, Status.NO_STATE):
             return None
         return self.decision.level is not Level.SOLUTION
+
+    def live_by(self, now_s: Callable[[], float]) -> None:
+        """Budgets and execution times are measured by this clock [s], not by the system's."""
+        self._clock = self.controller.artefact.ffi.callback("double(void *)", lambda _: now_s())
+        null = self.controller.artefact.ffi.NULL
+        self._library.br_cycle_set_clock(self._cycle, self._clock, null)
 
     def stop(self) -> None:
         """From the next cycle on slow down along the line to standstill, and stay."""
@@ -294,6 +308,7 @@ class Driver:
         if reception != library.BR_STATE_NEW:
             self._refused = state
             return False
+        self.taken += 1
         self.newest, self.belief, self._instruments = state, None, instruments
         if begins and state.estimated:
             self._trust_model()
@@ -328,10 +343,16 @@ class Driver:
         decision.decided_at_s, decision.delay_s = decided.decided_at_s, decided.delay_s
         decision.fault = decided.fault
         decision.step_us, decision.stepped = decided.step_us, bool(decided.stepped)
+        decision.late_s = decided.late_s
+        decision.refused = self.refusals if budget_s > 0 and decision.stepped else ()
         if decision.status == Status.STEP_FAILED:
             text = self._library.br_mpc_error_text(decided.error)
             self.last_error = self.controller.last_error or self.controller.artefact.text(text)
         return decision
+
+    def sent(self, decided_at_s: float, u: tuple[float, ...]) -> None:
+        """What another controller has sent, which drives: this one is its shadow."""
+        self._library.br_cycle_sent(self._cycle, decided_at_s, u)
 
     def braking(self, seq: int) -> BrakingPlan | None:
         """What the car's guard shall do if nothing more comes; None for a car that is halted or
@@ -341,7 +362,7 @@ class Driver:
             return None
         return BrakingPlan(
             seq=seq,
-            source_time_ns=time.monotonic_ns(),
+            source_time_ns=clock.monotonic_ns(),
             epoch=newest.epoch,
             run=newest.run,
             begins_s=max(plan.begins_s, 0.0),
@@ -353,6 +374,18 @@ class Driver:
     def prepare(self, period_s: float, budget_s: float = 0.0) -> None:
         """Preparation phase for a state that is expected a period after the last one."""
         self._library.br_cycle_prepare(self._cycle, period_s, budget_s)
+
+    @property
+    def refusals(self) -> tuple[int, ...]:
+        """Where the newest step's or preparation's time ran out: all that its clock has changed."""
+        refusals = self._refusals
+        return tuple(refusals[0 : self._library.br_cycle_get_refusals(self._cycle, refusals)])
+
+    def repeat(self, refused: Sequence[int]) -> None:
+        """The next :meth:`decide` or :meth:`prepare` with a budget runs out of time there, in place
+        of by the clock."""
+        error = self._library.br_cycle_repeat(self._cycle, list(refused), len(refused))
+        self.controller.artefact.check(error, "repetition")
 
     def rehearse(self) -> None:
         """Runs through a cycle without any effect, so that its code and data are in the caches."""

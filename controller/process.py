@@ -10,11 +10,11 @@ waits for no other process and logs nothing while it drives.
 import gc
 import logging
 import sys
-import time
 from collections.abc import Callable
 from functools import partial
 from typing import Any, Final
 
+from bayesrace import clock
 from bayesrace.controller.cycle import Cycle
 from bayesrace.controller.driver import Decision
 from bayesrace.controller.interface import Controller, Environment
@@ -35,7 +35,7 @@ from bayesrace.messages import (
     encode,
 )
 from bayesrace.processes import die_with_parent
-from bayesrace.realtime import prepare_thread, sleep_until_ns
+from bayesrace.realtime import prepare_thread
 from bayesrace.transport import (
     HEARTBEAT_S,
     LOCKSTEP_SPIN_S,
@@ -168,7 +168,7 @@ class ControllerProcess:
         if item.kind is not Kind.MESSAGE:
             self._service.react(item)
             return None
-        self._timing.decode_us = (time.monotonic_ns() - item.received_ns) * 1e-3
+        self._timing.decode_us = (clock.monotonic_ns() - item.received_ns) * 1e-3
         if item.value is None or not self._driver.observe(item.value):
             return None
         return self._recorded(item.value, item.received_ns)
@@ -181,14 +181,14 @@ class ControllerProcess:
         return state
 
     def _silent(self) -> bool:
-        return time.monotonic_ns() - self._arrived_ns > _SILENT_S * 1e9
+        return clock.monotonic_ns() - self._arrived_ns > _SILENT_S * 1e9
 
     def _left_over(self) -> State | None:
         """After silence: a state that was not driven on, to which its plant may want an answer."""
         left = self._driver.lost(silent=True) if self._silent() else None
         if left is None or not self._driver.observe(left):
             return None
-        return self._recorded(left, time.monotonic_ns())
+        return self._recorded(left, clock.monotonic_ns())
 
     def _leave(self, state: State | None) -> State | None:
         """Ends a loop, for want of states or with one that is not for it: the next one to drive."""
@@ -245,7 +245,7 @@ class ControllerProcess:
             late = newer is not None
             if not late:
                 self._prepare()
-                self._timing.skipped += schedule.advance(time.monotonic_ns())
+                self._timing.skipped += schedule.advance(clock.monotonic_ns())
                 newer = self._next_state()
             fresh = newer is not None
             state = newer or state
@@ -254,7 +254,7 @@ class ControllerProcess:
     def _tick(self, state: State, late: bool) -> None:
         """One cycle: decide, send, report; ``late``: a further one after the same release."""
         schedule, timing = self._schedule, self._timing
-        timing.released_ns = time.monotonic_ns()
+        timing.released_ns = clock.monotonic_ns()
         if late:
             timing.late_states += 1
             timing.wake_us = timing.prepare_us = 0.0
@@ -262,20 +262,20 @@ class ControllerProcess:
         # What has held up a state on its way is part of its age: hence the schedule's plant time,
         # not the time since this state's own arrival.
         decided_at_s = max(schedule.plant_time_s(timing.released_ns), state.time_s)
-        spent_s = (time.monotonic_ns() - schedule.release_ns) * 1e-9
+        spent_s = (clock.monotonic_ns() - schedule.release_ns) * 1e-9
         limits = self._limits()
         decision = self._cycle.decide(decided_at_s, budget_s, spent_s, limits)
-        timing.overruns += time.monotonic_ns() > self._budget_end_ns
+        timing.overruns += clock.monotonic_ns() > self._budget_end_ns
         self._send(state, decision)
-        timing.missed = time.monotonic_ns() > schedule.deadline_ns
+        timing.missed = clock.monotonic_ns() > schedule.deadline_ns
         timing.misses += timing.missed
 
     def _serve_others(self) -> None:
         """What has happened meanwhile."""
-        if min(self._budget_end_ns, time.monotonic_ns()) >= self._serve_ns:
+        if min(self._budget_end_ns, clock.monotonic_ns()) >= self._serve_ns:
             item = self.inbox.poll_queue()
             if item is not None:
-                self._serve_ns = time.monotonic_ns() + _SERVE_NS
+                self._serve_ns = clock.monotonic_ns() + _SERVE_NS
                 self._service.react(item)
         self._service.check_hold()
         self._service.beat()
@@ -288,12 +288,12 @@ class ControllerProcess:
         """
         if self._missing() != 1:
             return None
-        spent_ns = time.monotonic_ns() - self._timing.released_ns
+        spent_ns = clock.monotonic_ns() - self._timing.released_ns
         latest_ns = self._budget_end_ns - round(_ROOM * spent_ns)
-        while time.monotonic_ns() < latest_ns:
+        while clock.monotonic_ns() < latest_ns:
             if (late := self._newest_state(0)) is not None:
                 return late
-            time.sleep(POLL_S)
+            clock.sleep(POLL_S)
         return None
 
     def _prepare(self) -> None:
@@ -303,7 +303,7 @@ class ControllerProcess:
             self._adoption.between_cycles(self._next_cycle)
         pause_s = min(_WAY * self._schedule.period_ns, _WAY_NS) * 1e-9
         if self._left_s > pause_s:
-            time.sleep(pause_s)
+            clock.sleep(pause_s)
         self._plan_braking()
         if (left_s := self._left_s) > 0:
             until_next_ns = self._schedule.deadline_ns - self._timing.released_ns
@@ -312,7 +312,7 @@ class ControllerProcess:
     def _plan_braking(self) -> None:
         """Sends what the car's guard shall do if nothing more comes."""
         sent_ns = self._braking.sent_ns
-        due = sent_ns is None or time.monotonic_ns() - sent_ns > _BRAKING_NS
+        due = sent_ns is None or clock.monotonic_ns() - sent_ns > _BRAKING_NS
         if due and (plan := self._driver.braking(self._braking.next_seq)) is not None:
             self._braking.put(plan, lockstep=False)
 
@@ -322,8 +322,8 @@ class ControllerProcess:
         rehearses = period_ns >= _COLD_NS
         wake_ns = schedule.release_ns - min(round(_LEAD * period_ns), _LEAD_NS)
         wake_ns -= _REHEARSAL_NS if rehearses else 0
-        sleep_until_ns(wake_ns)
-        self._timing.wake_us = max(time.monotonic_ns() - wake_ns, 0) * 1e-3
+        clock.sleep_until_ns(wake_ns)
+        self._timing.wake_us = max(clock.monotonic_ns() - wake_ns, 0) * 1e-3
         if rehearses:
             self._rehearse()
         return self._newest_state(
@@ -370,7 +370,7 @@ class ControllerProcess:
     @property
     def _left_s(self) -> float:
         """Of the budget."""
-        return (self._budget_end_ns - time.monotonic_ns()) * 1e-9
+        return (self._budget_end_ns - clock.monotonic_ns()) * 1e-9
 
     @property
     def _budget_end_ns(self) -> int:
@@ -382,9 +382,9 @@ class ControllerProcess:
     def _send(self, state: State, decision: Decision) -> None:
         """The actuation, then how it came about."""
         timing = self._timing
-        begin_ns = time.perf_counter_ns()
+        begin_ns = clock.perf_counter_ns()
         self._actuations.put(self._actuation(state, decision), lockstep=state.lockstep)
-        timing.encode_us = (time.perf_counter_ns() - begin_ns) * 1e-3
+        timing.encode_us = (clock.perf_counter_ns() - begin_ns) * 1e-3
         message = self._cycle.telemetry(self._telemetry.next_seq, state, decision, self._arrived_ns)
         self._telemetry.put(message, lockstep=state.lockstep)
 

@@ -18,6 +18,12 @@ class ControllerSettings(CycleSettings):
 
     car: CarSetting = Field(default_factory=default_car)
     name: str = Field("", description="name of the car in the network; empty: the car's own")
+    shadow: str = Field(
+        "",
+        pattern=r"^[A-Za-z0-9_-]{0,40}$",
+        description="decide beside the controller that drives, as a shadow of this name, and send "
+        "nothing to the car: docs/shadow.md; empty: drive",
+    )
     endpoints: Endpoints = Endpoints(listen=(CONTROLLER_ENDPOINT,), connect=(PLANT_ENDPOINT,))
     rate_hz: float = Field(50.0, ge=1, le=500, description="rate in real time [Hz]")
     budget: Annotated[float, Option(metavar="SHARE")] = Field(

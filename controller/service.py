@@ -1,10 +1,10 @@
 """Requests that a running controller serves: status, stop, go, new weights; and its heartbeat."""
 
 import threading
-import time
 from collections.abc import Callable, Mapping
 from typing import Any, Final
 
+from bayesrace import clock
 from bayesrace.controller.driver import Driver, Level, Phase
 from bayesrace.controller.instruments import Instruments
 from bayesrace.controller.weights.manager import WeightUpdateManager
@@ -112,7 +112,7 @@ class Service:
             self._let_go = True
             self._holds_lost += 1
             self._text = f"stopped: {HOLD_MISSING}"
-            self.announce("hold_lost", self._text, {})
+            self.announce("hold_lost", self._text, self._next_cycle)
 
     @property
     def _drives(self) -> bool:
@@ -135,7 +135,7 @@ class Service:
     def status(self, seq: int = 0) -> Status:
         """The process's state at this moment."""
         driver, newest = self._driver, self._driver.newest
-        now_ns = time.monotonic_ns()
+        now_ns = clock.monotonic_ns()
         age_s = -1.0 if self.arrived_ns is None else (now_ns - self.arrived_ns) * 1e-9
         lockstep = newest is not None and newest.lockstep
         return Status(
@@ -191,12 +191,17 @@ class Service:
         else:
             self._driver.go()
             self._text = f"driving on request: {command.text}"
-        self.announce(command.command, self._text, request.by)
+        self.announce(command.command, self._text, request.by | self._next_cycle)
         request.reply(True, self._text)
+
+    @property
+    def _next_cycle(self) -> dict[str, Scalar]:
+        """Data of an event: the ``seq`` of the first telemetry that it acts on."""
+        return {"telemetry_seq": self._counters()["ticks"]}
 
     def announce(self, kind: str, text: str, data: Mapping[str, Scalar]) -> None:
         """Publishes an event; from any thread."""
-        now_ns = time.monotonic_ns()
+        now_ns = clock.monotonic_ns()
         newest = self._driver.newest
         run = 0 if newest is None else newest.run
         with self._publishing:

@@ -20,7 +20,10 @@ SAMPLES: Final = 512
 WATCHED: Final = 100
 """BR_WATCHED there: the newest of these, on which weights are compared while they are watched."""
 
-_SOLVER: Final = ("tolerance", "defect_max", "early_stop_tol", "iterations", "iterations_cold")
+_SOLVER: Final = (
+    "tolerance", "defect_max", "early_stop_tol", "iterations", "iterations_cold",
+    "qp_steps",
+)  # fmt: skip
 """BR_SOLVER_FIELDS in controller/native/bayesrace_mpc.h that have the names of settings."""
 
 
@@ -75,6 +78,13 @@ class MpcSettings(BaseModel):
         le=1000,
         description="the same after a reset; with a time budget the larger limits every step",
     )
+    qp_steps: int = Field(
+        4000,
+        ge=200,
+        le=1_000_000,
+        description="active-set steps that all QPs of a step may take together, and those of a "
+        "preparation: then the best plan so far counts, and the next step goes on from it",
+    )
 
     @field_validator("caution")
     @classmethod
@@ -108,7 +118,7 @@ class FallbackSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    shifted_s: float = Field(
+    shifted_s: Annotated[float, Option("--bridge", unit="ms", per_unit=1000)] = Field(
         default=0.1, ge=0, le=2, description="how long after its first input a plan may be driven"
     )
     recover_cycles: int = Field(

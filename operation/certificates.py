@@ -51,7 +51,7 @@ _AUTHORITY_DAYS: Final = 3650
 _CLOCKS: Final = timedelta(days=1)
 """How far clocks may be behind that of the authority."""
 _LOOPBACK: Final = ("localhost", "127.0.0.1", "::1")
-_LISTENERS: Final[tuple[Role, ...]] = ("plant", "controller", "router")
+_LISTENERS: Final[tuple[Role, ...]] = ("plant", "controller", "shadow", "router")
 
 
 class Entry(Member):

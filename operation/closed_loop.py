@@ -5,7 +5,6 @@ equal to the bit to the same run of two processes over Zenoh (tests/test_closed_
 weights are the caller's: nothing validates them, and no command can stop the run.
 """
 
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property
@@ -15,6 +14,7 @@ import numpy as np
 from msgspec import structs
 from numpy.typing import NDArray
 
+from bayesrace import clock
 from bayesrace.arrays import Floats
 from bayesrace.codegen.compiler import compiled
 from bayesrace.columns import Columns, columns_of
@@ -307,7 +307,7 @@ class _Messages:
     def _event(self, seq: int, run: int, kind: str, text: str, data: dict[str, Scalar]) -> None:
         event = Event(
             seq=seq,
-            source_time_ns=time.monotonic_ns(),
+            source_time_ns=clock.monotonic_ns(),
             run=run,
             source="plant",
             kind=kind,

@@ -32,7 +32,7 @@ __all__ = ["Check", "check_configuration", "examine", "probe"]
 
 _CARS_S: Final = 1.0
 _ROLES: Final[tuple[Role, ...]] = (
-    "director", "learning", "viewer", "controller", "plant", "router"
+    "director", "learning", "viewer", "controller", "plant", "router", "shadow"
 )  # fmt: skip
 """In the order in which a certificate of this machine is tried."""
 

@@ -1,5 +1,6 @@
 """Directs one run of a waiting plant and controller, from the start line to the last lap."""
 
+import logging
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
@@ -17,6 +18,8 @@ from bayesrace.vehicles import Car, car_text
 
 __all__ = ["drive_and_judge", "execute"]
 
+_log = logging.getLogger("bayesrace.drive")
+
 _ABSENCE_S = 10.0
 """In real time a process may be away for so long: a link comes back, a controller is started
 again, and the car waits at standstill."""
@@ -32,9 +35,11 @@ def execute(
     plan: RunPlan,
     recorder: Recorder | None = None,
     paused: Callable[[Event], None] = lambda _: None,
+    trouble: Callable[[], str] | None = None,
 ) -> Event:
     """Announces and starts the run and waits for its end; the plant's ``run_ended`` event.
-    ``paused`` is called at each of its pauses.
+    ``paused`` is called at each of its pauses. ``trouble``: a reason to abort the run; by default
+    that the recorder fails.
 
     How the car was driven is for :func:`bayesrace.operation.analysis.laps.judge`. InputError if
     the controller drives another track, the plant refuses, the recorder fails, or the run ended by
@@ -56,7 +61,7 @@ def execute(
             plan.run,
             30.0 + 3.0 * plan.max_time_s,
             absence_s,
-            lambda: recorder.failed if recorder else "",
+            trouble or (lambda: recorder.failed if recorder else ""),
             paused,
         )
     except BaseException as error:  # a car must not drive on unwatched
@@ -72,22 +77,52 @@ def execute(
 
 
 def drive_and_judge(
-    endpoints: Endpoints, car: Car, name: str, track: Track, plan: RunPlan, log: Path
+    endpoints: Endpoints,
+    car: Car,
+    name: str,
+    track: Track,
+    plan: RunPlan,
+    log: Path,
+    most_bytes: int | None = None,
 ) -> tuple[Event, Verdict]:
     """The next run, after those before, of the processes that wait, with a log: its end, and the
-    verdict. ``name``: the car's in the network. Raises as :func:`execute`."""
+    verdict. ``name``: the car's in the network; ``most_bytes``: size of the log at most.
+
+    Raises as :func:`execute`, but a log that cannot be written does not abort the run: a warning
+    names it at once, and the InputError comes after the run's end.
+    """
     endpoints.check_car(name)
     about = {"drive": {"car": car_text(car), "track": track.name}}
-    with (
-        open_session(endpoints, "director") as session,
-        Recorder(session, name, log, about) as recorder,
-    ):
-        director = Director(session, name)
-        director.wait_for(("plant", "controller"), 10.0)
-        publisher: Publisher[Event] = Publisher(session, EVENT, name, "race")
-        plan = replace(plan, run=director.status("plant").run + 1)
-        end = execute(director, publisher, track, plan, recorder)
+    end: Event | None = None
+    try:
+        with (
+            open_session(endpoints, "director") as session,
+            Recorder(session, name, log, about, most_bytes) as recorder,
+        ):
+            director = Director(session, name)
+            director.wait_for(("plant", "controller"), 10.0)
+            publisher: Publisher[Event] = Publisher(session, EVENT, name, "race")
+            plan = replace(plan, run=director.status("plant").run + 1)
+            end = execute(director, publisher, track, plan, trouble=_only_warned(recorder))
+    except InputError as error:
+        if end is None:
+            raise
+        raise InputError(f"{end.text}; not judged: {error}") from None
     return end, judge_log(log, plan.run, track, plan.laps)
+
+
+def _only_warned(recorder: Recorder) -> Callable[[], str]:
+    """Never a reason to abort a run; warns once when the log cannot be written any more."""
+    warned = False
+
+    def trouble() -> str:
+        nonlocal warned
+        if recorder.failed and not warned:
+            warned = True
+            _log.warning("%s; the run goes on without a log", recorder.failed)
+        return ""
+
+    return trouble
 
 
 def _check_track(track: Track, controllers: str) -> None:

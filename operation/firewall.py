@@ -76,16 +76,17 @@ def rules(network: NetworkSettings, role: Role, listen: Sequence[str] = ()) -> s
         remedy = "make rules for the router" if network.by_router else "name one, or give --listen"
         raise InputError(f"[network] has no endpoint at which the {role} listens: {remedy}")
     addresses = [address_of(one) for one in where]
-    others = [one.protocol for one in addresses if one.protocol in ("udp", "quic")]
-    if others:
+    unruled = [one.protocol for one in addresses if one.protocol in ("udp", "quic")]
+    if unruled:
         raise InputError(
-            f"rules are for tcp, tls and ws, not for {others[0]}: listen at one of them"
+            f"rules are for tcp, tls and ws, not for {unruled[0]}: listen at one of them"
         )
     ports = sorted({one.port for one in addresses if one.protocol != "unixsock-stream"})
     if 0 in ports or not ports:
         why = "a port that changes" if ports else "Unix sockets alone, which no other host reaches"
         raise InputError(f"the {role} listens at {why}: there is nothing to make rules for")
-    named = (address_of(one) for one in (*network.plant, *network.controller, *network.router))
+    others = (*network.plant, *network.controller, *network.shadow, *network.router)
+    named = map(address_of, others)
     hosts = [one.host for one in named if one.port and one.host not in _ANY]
     found = _looked_up((*hosts, *network.hosts))
     return _RULES.format(

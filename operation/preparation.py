@@ -38,6 +38,7 @@ from bayesrace.vehicles import Car
 
 __all__ = [
     "Prepared",
+    "model_artefact",
     "prepare",
     "progress_artefact",
     "trained_weights",
@@ -119,7 +120,7 @@ def prepare(
     artefacts = [] if artefact is None else [artefact]
     if artefact is None:
         with stages.stage("build the controllers"):
-            artefacts = [_artefact(settings, model) for model in models]
+            artefacts = [model_artefact(settings, model) for model in models]
     training, practices = None, list[Training]()
     if weights is None:
         training, practices, weights = _learned(settings, artefacts[0], prepared_tracks, stages)
@@ -235,7 +236,7 @@ def updated_weights(
     return trained_weights(every, model, training_settings(settings), first, progress), every
 
 
-def _artefact(settings: PreparationSettings, model: PredictionModel) -> Path:
+def model_artefact(settings: PreparationSettings, model: PredictionModel) -> Path:
     """Folder of the controller that predicts with this model."""
     if model == "dynamic":
         best = BuildSettings.best_case(settings.true_car, settings.horizon, settings.problem)
@@ -252,4 +253,4 @@ def _artefact(settings: PreparationSettings, model: PredictionModel) -> Path:
 def progress_artefact(settings: PreparationSettings) -> Path:
     """Folder of the controller that maximises progress, as ``bayesrace-limit`` does."""
     wanted = settings.model_copy(update={"problem": "progress", "horizon": None})
-    return _artefact(wanted, "e_kinematic")
+    return model_artefact(wanted, "e_kinematic")

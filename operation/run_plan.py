@@ -1,8 +1,8 @@
 """One run as its director plans it: what the plant is asked for, and what the log says of it."""
 
-import time
 from dataclasses import dataclass
 
+from bayesrace import clock
 from bayesrace.messages import Event, RunRequest, Scalar
 from bayesrace.tracks import StartLine, Track
 
@@ -33,7 +33,7 @@ def run_request(track: Track, plan: RunPlan) -> RunRequest:
     line = StartLine(track)
     return RunRequest(
         seq=0,
-        source_time_ns=time.monotonic_ns(),
+        source_time_ns=clock.monotonic_ns(),
         run=plan.run,
         lockstep=plan.lockstep,
         x0=(x, y, psi, plan.start_speed_mps, 0.0, 0.0, 0.0),
@@ -65,7 +65,7 @@ def announcement(plan: RunPlan, seq: int, weights_version: str, refused: str = "
     }
     return Event(
         seq=seq,
-        source_time_ns=time.monotonic_ns(),
+        source_time_ns=clock.monotonic_ns(),
         run=plan.run,
         source="race",
         kind="run",

@@ -6,12 +6,12 @@ does so by a function call. Both drive the car through :func:`drive_lockstep`, s
 equal to the bit.
 """
 
-import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
+from bayesrace import clock
 from bayesrace.messages import Reading, RunRequest, State, Truth
 from bayesrace.plant.sensors import SensorPlayer
 from bayesrace.plant.vehicle import FmuFault, Vehicle
@@ -131,7 +131,7 @@ class CarRun:
     ) -> tuple[State, tuple[float, ...]]:
         """What is measured, and the true state (7,); see :func:`truth_behind`."""
         vehicle, request = self.vehicle, self.request
-        now_ns, x = time.monotonic_ns(), tuple(vehicle.x.tolist())
+        now_ns, x = clock.monotonic_ns(), tuple(vehicle.x.tolist())
         readings = self._readings(x)
         state = State(
             seq=seq,

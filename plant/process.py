@@ -3,12 +3,12 @@
 import gc
 import logging
 import secrets
-import time
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict
 from typing import Any
 
+from bayesrace import clock
 from bayesrace.errors import InputError
 from bayesrace.messages import (
     ACTUATION,
@@ -104,7 +104,7 @@ class PlantProcess:
     def serve(self, renewed: Callable[[], Any] = lambda: None) -> None:
         """Until SIGINT or SIGTERM; ``renewed``: :meth:`.Sessions.renewed`, between runs."""
         while not self._stopping:
-            if time.monotonic() > self._spare_s and (session := renewed()) is not None:
+            if clock.monotonic() > self._spare_s and (session := renewed()) is not None:
                 publishers = self._heartbeat, self._states, self._truths, self._events
                 for one in (*publishers, self._hold, self.inbox):
                     one.bind(session)
@@ -136,7 +136,7 @@ class PlantProcess:
         gc.collect()
         end = self._run.execute()
         self._conclude(message, end)
-        self._spare_s = time.monotonic() + _SPARE_S
+        self._spare_s = clock.monotonic() + _SPARE_S
 
     def _prepare(self, message: RunRequest) -> str:
         """Make the run; returns why it cannot be, or ""."""
@@ -180,8 +180,10 @@ class PlantProcess:
                 hold=self._hold,
                 epoch=self._epoch,
                 delay_s=self._settings.delay_s,
+                buffer_s=self._settings.buffer_s,
                 sensors=self._settings.instruments,
                 seed=self._settings.seed,
+                faults=self._settings.faults,
             )
         except (InputError, FmuFault) as error:
             return str(error)
@@ -196,9 +198,9 @@ class PlantProcess:
             self._numbering.note(item.value.seq)
 
     def _controller_there(self) -> bool:
-        deadline = time.monotonic() + self._settings.controller_wait_s
+        deadline = clock.monotonic() + self._settings.controller_wait_s
         while "controller" not in self.inbox.alive:
-            left_s = deadline - time.monotonic()
+            left_s = deadline - clock.monotonic()
             if left_s <= 0 or self._stopping:
                 return False
             item = self.inbox.get(left_s)
@@ -268,7 +270,7 @@ class PlantProcess:
         running, self._text = self._text, f"run {self._run_number} waits at {time_s:.2f} s"
         self._waits = True
         self._publish_event("pause", self._text, {"time_s": time_s})
-        deadline = time.monotonic() + _PAUSE_S
+        deadline = clock.monotonic() + _PAUSE_S
         end: End | None = None
         while self._waits and end is None:
             item = self.inbox.get(HEARTBEAT_S)
@@ -278,14 +280,14 @@ class PlantProcess:
                 self._overheard(item)
             elif item is not None:
                 end = self._react(item)
-            if end is None and time.monotonic() > deadline:
+            if end is None and clock.monotonic() > deadline:
                 end = End("abandoned", f"the run waited {_PAUSE_S:g} s in a pause: no go_on came")
             end = end or self._beat()
         self._waits, self._text = False, running
         return end
 
     def _publish_event(self, kind: str, text: str, data: Mapping[str, Scalar]) -> None:
-        now_ns = time.monotonic_ns()
+        now_ns = clock.monotonic_ns()
         event = Event(
             seq=self._events.next_seq,
             source_time_ns=now_ns,
@@ -313,24 +315,24 @@ class PlantProcess:
     def _suspended(self, seconds: float) -> None:
         text = f"{suspension(seconds)}; the run goes on where it was"
         _log.warning("%s", text)
-        self._news = time.monotonic() + _RELINKED_S, text, {"seconds": seconds}
+        self._news = clock.monotonic() + _RELINKED_S, text, {"seconds": seconds}
 
     def _beat(self) -> End | None:
         """Publishes the status when it is due; returns what ends the current run, if anything."""
         self._heartbeat.beat(self._status)
-        if self._news is not None and time.monotonic() > self._news[0]:
+        if self._news is not None and clock.monotonic() > self._news[0]:
             _, text, data = self._news
             self._news = None
             self._publish_event("suspended", text, data)
         gone_ns = self._director_gone_ns
-        if gone_ns is not None and time.monotonic_ns() - gone_ns >= _ABANDONED_S * 1e9:
+        if gone_ns is not None and clock.monotonic_ns() - gone_ns >= _ABANDONED_S * 1e9:
             gone = "the process that started the run has been gone"
             return End("abandoned", f"{gone} for {_ABANDONED_S:g} s")
         return None
 
     def _status(self, seq: int = 0) -> Status:
         phase = "idle" if self._run is None else "running"
-        now_ns = time.monotonic_ns()
+        now_ns = clock.monotonic_ns()
         return Status(
             seq=seq,
             source_time_ns=now_ns,
@@ -377,6 +379,8 @@ def main(
     )  # fmt: skip
     if hardware is not None and (settings.delay_s or settings.changes.root):
         raise InputError("a real car has delays and a world of its own: leave out delay_s, world")
+    if hardware is not None and settings.sensor_faults:
+        raise InputError("sensors of a real car fail by themselves: leave out sensor_faults")
     settings.endpoints.check_car(settings.name or settings.car.name)
     with vehicles as vehicle, open_sessions(settings.endpoints, "plant") as sessions:
         process = PlantProcess(sessions.current, settings, vehicle)

@@ -1,13 +1,13 @@
 """One run of the plant, in lockstep or in real time; the same car below both."""
 
 import heapq
-import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import chain
 from typing import Final, NamedTuple
 
+from bayesrace import clock
 from bayesrace.messages import (
     ACTUATION,
     Actuation,
@@ -19,8 +19,9 @@ from bayesrace.messages import (
     Truth,
 )
 from bayesrace.plant.car import CarRun, End, drive_lockstep, fault_end, truth_behind
+from bayesrace.plant.faults import FaultPlayer, SensorFault
 from bayesrace.plant.vehicle import Command, FmuFault, Vehicle, planned_at
-from bayesrace.realtime import SUSPENDED_S, sleep_until_ns
+from bayesrace.realtime import SUSPENDED_S
 from bayesrace.sensors import EXACT, Sensors
 from bayesrace.transport import LOCKSTEP_SPIN_S, Inbox, Item, Kind, Publisher
 from bayesrace.transport.hold import HOLD_MISSING, HoldWatch
@@ -37,6 +38,8 @@ _OVERDUE: Final = 1.5
 _LONGEST_S: Final = 0.1
 """... which counts as no longer than this [s]."""
 
+_NEVER: Final = -1.0
+"""In place of a delay, see ``State.actuation_delays``."""
 _MOST_DELAYS: Final = 64
 """Rows of ``State.actuation_delays`` that one message has room for."""
 
@@ -103,14 +106,19 @@ class Run:
     epoch: int
     delay_s: float = 0.0
     """Added to states and to actuations."""
+    buffer_s: float = 0.0
+    """From the decision on an input until it acts, at least: :attr:`.PlantSettings.buffer_s`."""
     sensors: Sensors = EXACT
     seed: int = 0
     """Of what they add."""
+    faults: Sequence[SensorFault] = ()
 
     def __post_init__(self) -> None:
+        self._faults = FaultPlayer(self.faults)
         played = self.sensors, 2 * self.delay_s, self.seed
         self._car = CarRun(self.request, self.simulator, self.epoch, *played)
         self._delay_ns = round(self.delay_s * 1e9)
+        self._start_ns = 0
         self._pauses = 0
         # In real time:
         self._outbox: deque[tuple[int, State, tuple[float, ...]]] = deque()
@@ -149,7 +157,7 @@ class Run:
 
     def _send(self, state: State, x: tuple[float, ...]) -> None:
         """The truth goes second: it must not delay the measurement. Of a real car there is none."""
-        self.states.put(state, lockstep=state.lockstep)
+        self.states.put(self._faults.report(state), lockstep=state.lockstep)
         if not self.simulator.real:
             self.truths.put(truth_behind(state, x), lockstep=state.lockstep)
 
@@ -170,10 +178,10 @@ class Run:
 
     def _answer_to(self, seq: int) -> tuple[float, ...] | End:
         """Waits for the actuation that answers this state, or for what ends the run."""
-        deadline = time.monotonic() + self.request.actuation_timeout_s
+        deadline = clock.monotonic() + self.request.actuation_timeout_s
         run = self.request.run
         while True:
-            item = self.inbox.get(deadline - time.monotonic())
+            item = self.inbox.get(deadline - clock.monotonic())
             if item is None:
                 return self._timed_out(seq)
             if item.kind is Kind.MESSAGE:
@@ -202,18 +210,20 @@ class Run:
         period_ns = round(self.simulator.step_s * 1e9)
         seq = self.states.next_seq
         first = self._car.sample(seq)
-        start_ns, late_ns = first[0].source_time_ns, 0
+        late_ns = 0
+        self._start_ns = start_ns = first[0].source_time_ns
         self.simulator.begins(start_ns)
         self._enqueue(*first)
         while True:
             begin_ns = start_ns + self.simulator.steps * period_ns
             end = self._pass(begin_ns + period_ns)
-            before_ns, late_ns = late_ns, time.monotonic_ns() - begin_ns - period_ns
+            before_ns, late_ns = late_ns, clock.monotonic_ns() - begin_ns - period_ns
             if late_ns - before_ns > SUSPENDED_S * 1e9:
                 # Not to be made up for: nobody could have driven the car meanwhile.
                 self.counters.suspended += 1
                 self.suspended(late_ns * 1e-9)
                 start_ns, begin_ns, late_ns = start_ns + late_ns, begin_ns + late_ns, 0
+                self._start_ns = start_ns
                 self.simulator.begins(start_ns)
             self.counters.overruns += late_ns > period_ns
             asked = end or self._receive()
@@ -270,10 +280,12 @@ class Run:
             return None
         self.simulator.actuate(self._fresh(0))
         acting = self._held
-        while (left_ns := until_ns - time.monotonic_ns()) > 0:
+        while (left_ns := until_ns - clock.monotonic_ns()) > 0:
             if (end := self._receive(left_ns * 1e-9)) is not None:
                 return end
-            new = max((one.actuation for one in self._waiting), key=_decided, default=None)
+            now_ns = clock.monotonic_ns()
+            due = (one.actuation for one in self._waiting if one.acts_ns <= now_ns)
+            new = max(due, key=_decided, default=None)
             if new is None or self._lost_s is not None:
                 continue
             if acting is None or _decided(new) > _decided(acting):
@@ -291,11 +303,11 @@ class Run:
     def _sleep_and_send(self, until_ns: int) -> None:
         """Sleep, sending the states whose delay is over in the meantime."""
         outbox = self._outbox
-        while outbox and outbox[0][0] <= max(until_ns, time.monotonic_ns()):
+        while outbox and outbox[0][0] <= max(until_ns, clock.monotonic_ns()):
             due_ns, state, x = outbox.popleft()
-            sleep_until_ns(due_ns)
+            clock.sleep_until_ns(due_ns)
             self._send(state, x)
-        sleep_until_ns(until_ns)
+        clock.sleep_until_ns(until_ns)
 
     def _receive(self, wait_s: float = 0.0) -> End | None:
         """Takes what has arrived by now, and no more: requests without end must not hold up the
@@ -319,9 +331,11 @@ class Run:
                 if not mine or ahead or not known:
                     self.counters.stale += 1
                     continue
-                waiting = _Waiting(
-                    item.received_ns + self._delay_ns, self.numbering.received, actuation
+                due_s = actuation.decided_at_s + self.buffer_s if self.buffer_s else 0.0
+                acts_ns = max(
+                    item.received_ns + self._delay_ns, self._start_ns + round(due_s * 1e9)
                 )
+                waiting = _Waiting(acts_ns, self.numbering.received, actuation)
                 heapq.heappush(self._waiting, waiting)
             elif (end := self.react(item)) is not None:
                 return end
@@ -335,21 +349,23 @@ class Run:
         substep_ns = simulator.step_s * 1e9 / simulator.substeps
         commands: list[tuple[int, Command]] = []
         delays: list[float] = []
-        done = 0
+        done, came = 0, False
         while self._waiting and self._waiting[0].acts_ns < end_ns:
             acts_ns, _, new = heapq.heappop(self._waiting)
             arrival_s = (acts_ns - self._sampled_ns.get(new.state_seq, acts_ns)) * 1e-9
             if self._held is not None and new.decided_at_s <= self._held.decided_at_s:
                 self.counters.stale += 1
-                delays += (float(new.state_seq), arrival_s, -1.0)
+                delays += (float(new.state_seq), arrival_s, _NEVER)
                 continue
             # It acts from the first substep that begins after its arrival.
             at = min(max(-int((begin_ns - acts_ns) // substep_ns), done), simulator.substeps)
             if at > done:
                 commands.append((at - done, self._fresh(done)))
+            elif came:  # with the one before, as after a link was held up: that one never acts
+                delays[-1] = _NEVER
             before_s = new.decided_at_s if self._held is None else self._held.decided_at_s
             self._interval_s = min(new.decided_at_s - before_s, _LONGEST_S)
-            self._held, done = new, at
+            self._held, done, came = new, at, True
             self._held_since_s = simulator.time_s + at * substep_ns * 1e-9
             acting_s = self._held_since_s - new.decided_at_s + simulator.command_s
             delays += (float(new.state_seq), arrival_s, acting_s)

@@ -237,6 +237,7 @@ class _Drive:
         """``make``: a new controller for this problem with these settings."""
         tolerance, self._every = _CONVERGED[problem]
         endless = {"iterations": 1000, "iterations_cold": 1000, "early_stop_tol": 0.0}
+        endless["qp_steps"] = 1_000_000
         self._exact = mpc.model_copy(update=endless | {"tolerance": tolerance})
         self._car, self._make = car, make
         self.states: list[State] = []

@@ -251,7 +251,7 @@ def native_numbers(settings: MpcSettings, car: Car, weights: Weights) -> Floats:
     values = settings.parameters(car)
     problem = tracking(e_kinematic(car), PREDICTION)
     solver = ("tolerance", "defect_max", "early_stop_tol", "caution_sigmas", "iterations",
-              "iterations_cold")  # fmt: skip
+              "iterations_cold", "qp_steps")  # fmt: skip
     names = [*(one.name for one in problem.parameters), *solver]
     parts: list[ArrayLike] = [[values[name] for name in names]]
     for output in weights.outputs:

@@ -10,16 +10,14 @@ from msgspec import structs
 from bayesrace.controller.process_settings import ControllerSettings
 from bayesrace.messages import Reading, State
 from bayesrace.operation.closed_loop import ClosedLoop
+from bayesrace.plant.faults import ReadingFault
 from bayesrace.sensors import BUILT_IN, Sensors
 from tests.racing import Racing
 
-__all__ = ["FINE", "ROUGH", "Arriving", "Fault", "Seen", "mocap", "odometry", "reading"]
+__all__ = ["FINE", "ROUGH", "Arriving", "Seen", "mocap", "odometry", "reading"]
 
 FINE, ROUGH = (0.5, 0.2), (1.0, 0.5)
 """Noise of a pose: mm, degrees."""
-
-Fault = Callable[[Reading, Reading], Reading | None]
-"""What an instrument reports in place of a reading, given the last one before the fault."""
 
 Arriving = Callable[[State, State], State | None]
 """What the controller gets of a state with readings, given the true one; None: it is lost."""
@@ -57,7 +55,7 @@ class Seen(ClosedLoop):
         """When someone says go."""
         self.fail("", lambda reading, _: reading, 0.0, 0.0)
 
-    def fail(self, name: str, fault: Fault, begin_s: float, lasts_s: float) -> None:
+    def fail(self, name: str, fault: ReadingFault, begin_s: float, lasts_s: float) -> None:
         """What is measured from plant time begin_s on."""
         self._failing, self._fault, self._begin_s = name, fault, begin_s
         self._end_s = begin_s + lasts_s

@@ -194,7 +194,7 @@ def test_over_udp_no_other_sender_ends_the_run_or_takes_its_answers(
     [
         (("margin_m", "margin"), "settings.txt has an unknown name: margin"),
         (("stale_s ", "stale_s 1 "), "settings.txt has more than a number: stale_s"),
-        (("iterations ", "iterations 1."), "settings.txt has no whole number from 0 to 1000"),
+        (("iterations ", "iterations 1."), "settings.txt has no whole number from 0 to 1000000"),
         (("stale_s", "# " + 600 * "x"), "settings.txt has a line that is too long"),
         (("r_duty ", "r_duty x"), "settings.txt lacks a number: r_duty"),
         (("stale_s", "# stale_s"), "settings.txt lacks a line: stale_s"),

@@ -24,10 +24,11 @@ EVIL = "a\x1b[2Jb\x07c"
 SUBCOMMANDS = (
     "race", "drive", "report", "bench", "tracks", "cars", "raceline", "collect", "identify",
     "train", "build", "export", "limit",
-    "plant", "controller", "status", "stop", "go", "router", "latency",
+    "plant", "controller", "shadow", "status", "stop", "go", "router", "latency", "timing",
     "fmu export", "fmu inspect", "fmu weights",
     "validate", "publish", "rollback", "learn",
     "campaign", "campaign-report", "campaign-scheduler", "campaign-worker", "tune", "paper",
+    "replay", "scenario",
     "config show", "config check", "config example", "config firewall", "doctor",
     "certs init", "certs add", "certs list", "certs revoke",
 )  # fmt: skip
@@ -48,7 +49,15 @@ def test_help_reads_well(cli: Cli, name: str, monkeypatch: pytest.MonkeyPatch) -
     assert "--help" in outcome.out
     if not name:
         assert all(command.split()[0] in outcome.out for command in SUBCOMMANDS)
-        tasks = ("Race", "Prepare", "Drive", "Learn while driving", "Measure", "Export to other")
+        tasks = (
+            "Race",
+            "Prepare",
+            "Drive",
+            "Learn while driving",
+            "Evidence",
+            "Measure",
+            "Export to other",
+        )
         assert all(f"\n{task}" in outcome.out for task in tasks)
         assert "--install-completion" in outcome.out
 

@@ -211,3 +211,32 @@ def test_losses_are_counted_also_when_the_first_message_of_a_restarted_sender_is
     for seq in (0, 1, 3, 2, 4):
         overtaken.note(seq)
     assert (overtaken.received, overtaken.lost) == (5, 0)
+
+
+def test_a_shadow_predicts_by_the_inputs_of_the_controller_that_drives(
+    kinematic_artefact: Path,
+) -> None:
+    """Both are shown the same state, in which the input to come will act; alone it would not be."""
+    delay = CompensationSettings(mode="fixed", delay_s=3.5 * STEP_S)
+    seen: dict[str, list[Floats]] = {"driving": [], "shadow": [], "alone": []}
+
+    def driver(name: str, u: tuple[float, float]) -> Driver:
+        def answer(x: Floats) -> StepOutput:
+            seen[name].append(x.copy())
+            return StepOutput(u=np.array(u))
+
+        law = ScriptedLaw(answer, exact)
+        return scripted_driver(kinematic_artefact, law, compensation=delay)
+
+    driving, shadow, alone = driver("driving", (0.8, 1.0)), *(
+        driver(name, (0.1, -2.0)) for name in ("shadow", "alone")
+    )  # fmt: skip
+    for seq in range(10):
+        moment = state(seq, x=(0.1 * seq, 0.0, 0.0, 2.0, 0.0, 0.0, 0.0), u_applied=(0.8, 1.0))
+        for one in (driving, shadow, alone):
+            assert one.observe(moment)
+            one.decide(moment.time_s)
+        sent = driving.decision
+        shadow.sent(sent.decided_at_s, (sent.d, sent.delta_rate))
+    assert np.array_equal(seen["shadow"], seen["driving"])
+    assert np.abs(np.subtract(seen["alone"], seen["driving"])).max() > 0.05

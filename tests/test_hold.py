@@ -58,7 +58,7 @@ class Watched:
 @pytest.fixture
 def watched(monkeypatch: pytest.MonkeyPatch) -> Watched:
     clock = Clock()
-    monkeypatch.setattr(hold_module, "time", clock)
+    monkeypatch.setattr(hold_module, "clock", clock)
     monkeypatch.setattr(hold_module, "in_transport_thread", lambda callback: callback)
     return Watched(clock)
 

@@ -97,6 +97,8 @@ def test_log_time_is_car_time(tmp_path: Path, lockstep: bool) -> None:
         ("actuation", decided(0.0), 0.002, 0.0),  # overtaken by the next state
         ("telemetry", telemetry, 0.002, 0.0),
         ("actuation", decided(0.04), 0.003, 0.04),  # has overtaken its state
+        ("shadow/new/actuation", decided(0.0), 0.003, 0.0),  # behind the controller
+        ("shadow/new/telemetry", telemetry, 0.003, 0.0),
         ("state", sample(1, 0.04), 0.004, 0.04),
         ("telemetry", telemetry, 0.004, 0.04),
         ("state", sample(1, 1e9), 0.005, 0.04),

@@ -185,6 +185,8 @@ def largest(form: inspect.Type, valid: Any) -> Any:
             return largest(inner, valid)
         case inspect.StrType(max_length=int() as most):
             return "😀" * most
+        case inspect.IntType():
+            return valid if type(valid) is int else 1
         case inspect.StructType(cls=kind):
             return kind(**{one.name: largest(one.type, 0.0) for one in form.fields})
         case inspect.DictType(key_type=inspect.Metadata(extra_json_schema={"enum": words})):

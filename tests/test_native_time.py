@@ -291,3 +291,70 @@ def test_every_status_has_the_librarys_text(native: NativeStep) -> None:
     texts = [native.artefact.text(native._library.br_mpc_status_text(i)) for i in numbers]
     assert len(set(texts)) == known + 1
     assert (texts[Status.BAD_STATE], texts[-1]) == ("bad state", "unknown status")
+
+
+# --- QP steps are bounded, whatever the time ---------------------------------------------------
+
+
+def test_all_qps_of_a_step_keep_to_their_number_of_steps(make: Make, circuit: Circuit) -> None:
+    """A standing start askew of the line takes hundreds; cut off, the next step goes on, and ends
+    where it does with more of them."""
+    free, cut = make(qp_steps=1_000_000), make(qp_steps=200)
+    x, y = circuit.table.rows[0, :2]
+    hard = 0
+    for heading in np.linspace(-1.2, 1.2, 9):
+        state = np.array([x, y, np.pi / 2 + heading, 0.1, 0, 0, 0])
+        for step in (free, cut):
+            step.reset()
+        assert free.step(state, 0.0) is not None
+        hard += free.info.qp_iterations > 200
+        for _ in range(60):
+            status = cut.step(state, 0.0, elapsed_s=0.0)
+            assert cut.info.qp_iterations <= 200
+            assert status is not Status.TIME_LIMIT or cut.info.time_limited
+            if status.usable:
+                break
+        else:
+            pytest.fail("no usable plan")
+        assert cut.info.defect <= SETTINGS.defect_max
+    assert hard >= 2
+
+
+def test_steps_that_do_not_reach_the_limit_do_not_know_of_it(
+    make: Make, recorded: list[Problem]
+) -> None:
+    free, limited = make(qp_steps=1_000_000), make(qp_steps=400)
+    for p in recorded[:60]:
+        assert solve(free, p) is solve(limited, p)
+        assert free.info.qp_iterations < 400
+        assert free.u.tobytes() == limited.u.tobytes()
+    with pytest.raises(InputError, match="out of its range"):
+        limited.set_values({"qp_steps": 199})
+
+
+# --- repeated by another clock ---
+
+
+def test_another_step_is_out_of_time_where_one_was(make: Make, recorded: list[Problem]) -> None:
+    """Whatever its clock says: so real-time drives are replayed to the bit."""
+    one, two = make(defect_max=1e-7), make(defect_max=1e-7)
+    hurried, patient = Clock(one, 1e-3), Clock(two, 0.0)
+    refused = one.artefact.ffi.new("int[]", one.artefact.library.BR_REFUSALS)
+    seen = set()
+    for at in range(50, 70):
+        p = recorded[at]
+        for step in (one, two):
+            solve(step, p, elapsed_s=0.02, budget_s=9.0 if step is two else 0.002 * (at % 9 + 1))
+            assert step.info.time_limited == one.info.time_limited
+            seen.add(step.info.time_limited)
+            count = step._library.br_mpc_get_refusals(step.handle, refused)
+            if step is one:
+                two._library.br_mpc_repeat(two.handle, refused, count)
+        assert (one.u == two.u).all()
+        for step, budget_s in ((one, 0.002 * (at % 7 + 1)), (two, 9.0)):
+            step.prepare(0.02, budget_s)
+            if step is one:
+                count = one._library.br_mpc_get_refusals(one.handle, refused)
+                two._library.br_mpc_repeat(two.handle, refused, count)
+    assert seen == {0, 1}
+    assert hurried.now_s > patient.now_s == 0.0

@@ -35,7 +35,7 @@ VALUES = {
     "q": 1.0, "q_end": 4.0, "r": 0.05, "r_change": 0.02, "r_fan": 0.1, "w_obstacle": 200.0,
     "w_lane": 60.0, "lane": 0.55, "a_max": 3.0, "heat_max": 0.5,
     "tolerance": 1e-9, "defect_max": 0.03, "early_stop_tol": 0.0,
-    "iterations": 80, "iterations_cold": 80,
+    "iterations": 80, "iterations_cold": 80, "qp_steps": 100_000,
 }  # fmt: skip
 IPOPT = {
     "tol": 1e-11, "constr_viol_tol": 1e-11, "compl_inf_tol": 1e-13, "bound_relax_factor": 0.0,

@@ -14,9 +14,7 @@ from unittest.mock import MagicMock
 import numpy as np
 import pytest
 
-import bayesrace.controller.cycle
-import bayesrace.controller.process
-import bayesrace.controller.service
+import bayesrace.clock
 from bayesrace.arrays import Floats
 from bayesrace.controller.interface import Environment, StepOutput
 from bayesrace.controller.process import ControllerProcess, ControllerSettings
@@ -24,7 +22,7 @@ from bayesrace.controller.python_controller import PythonController
 from bayesrace.controller.settings import GateSettings
 from bayesrace.controller.weights.adoption import Adoption, Task
 from bayesrace.messages import Actuation, State, Telemetry, decode, encode
-from bayesrace.transport import Item, Kind, inbox, publisher
+from bayesrace.transport import Item, Kind
 from bayesrace.vehicles import get_car
 from tests.cycle_rig import ScriptedLaw, state
 from tests.instruments import reading
@@ -37,7 +35,7 @@ TRANSPORT_NS = MS // 2
 
 @dataclass
 class Clock:
-    """Stands in for the module ``time``; time passes in sleep, and where the test lets it. Who
+    """Stands in for :mod:`bayesrace.clock`; time passes in sleep, and where the test lets it. Who
     sleeps to a deadline wakes 30 us late."""
 
     now_ns: int = BEGIN_NS
@@ -49,8 +47,6 @@ class Clock:
 
     def monotonic(self) -> float:
         return self.now_ns * 1e-9
-
-    time = monotonic
 
     def sleep(self, duration_s: float) -> None:
         self.now_ns += round(duration_s * 1e9)
@@ -168,10 +164,8 @@ Make = Callable[..., Loop]
 def loop(kinematic_artefact: Path, monkeypatch: pytest.MonkeyPatch) -> Make:
     """Makes a loop in simulated time."""
     clock = Clock()
-    modules = bayesrace.controller.process, bayesrace.controller.cycle, bayesrace.controller.service
-    for module in (*modules, inbox, publisher):
-        monkeypatch.setattr(module, "time", clock)
-    monkeypatch.setattr(bayesrace.controller.process, "sleep_until_ns", clock.sleep_until_ns)
+    for name in ("monotonic_ns", "monotonic", "perf_counter_ns", "sleep", "sleep_until_ns"):
+        monkeypatch.setattr(bayesrace.clock, name, getattr(clock, name))
     return lambda **settings: Loop(kinematic_artefact, clock=clock, **settings)
 
 

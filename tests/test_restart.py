@@ -27,6 +27,7 @@ from bayesrace.messages import (
     encode,
 )
 from bayesrace.transport import Endpoints, Publisher, free_endpoint, open_session
+from bayesrace.transport.relay import Relay
 from tests.car_fmu import packed_car
 from tests.network.cars import (
     Course,
@@ -37,7 +38,6 @@ from tests.network.cars import (
     start_router,
 )
 from tests.network.observer import Journey, Observer, drive_on, observing
-from tests.network.proxy import Proxy
 from tests.programs import until
 
 pytestmark = pytest.mark.wall_clock
@@ -57,7 +57,7 @@ class Rig:
     start_plant: Callable[..., Program]
     start_controller: Callable[[], Program]
     start_router: Callable[[], Program]
-    proxy: Proxy
+    proxy: Relay
     observer: Observer
     plant_at: str
     controller_at: str
@@ -101,7 +101,7 @@ def rigged(
     """``way``: between plant and controller; with a router it is all that anybody knows."""
     plant_at, controller_at, router_at = free_endpoint(), free_endpoint(), free_endpoint()
     log = tmp_path / "run.mcap"
-    with ExitStack() as programs, Proxy(plant_at) as proxy:
+    with ExitStack() as programs, Relay(plant_at) as proxy:
 
         def a_plant(*options: str) -> Program:
             connect = [router_at] if way == "router" else []

@@ -18,6 +18,7 @@ from bayesrace.controller.driver import Level
 from bayesrace.messages import State
 from bayesrace.operation.closed_loop import ClosedLoop, Driven, built_in_car
 from bayesrace.plant.car import End
+from bayesrace.plant.faults import STATE_FAULTS, StateFault
 from bayesrace.vehicles import get_car
 from tests.racing import Racing, racing
 
@@ -27,84 +28,38 @@ BEGIN_S = 0.6
 MOCAP = (0.001, 0.001, math.radians(0.5), 0.05, 0.05, 0.2, 0.0005)
 """Standard deviations of states that are made of motion capture."""
 
-Fault = Callable[[Sequence[State]], State]
-"""What is reported in place of the last of the states measured since the fault began."""
-
-
-def changed(**what: Callable[[float], float]) -> Fault:
-    """These numbers of the state, so changed."""
-    names = ("x", "y", "psi", "vx", "vy", "omega", "delta")
-
-    def report(states: Sequence[State]) -> State:
-        x = zip(names, states[-1].x, strict=True)
-        same: Callable[[float], float] = float
-        return replace(states[-1], x=tuple(what.get(name, same)(value) for name, value in x))
-
-    return report
-
-
-def swapped(*order: int) -> Fault:
-    return lambda states: replace(states[-1], x=tuple(states[-1].x[i] for i in order))
-
-
-def held(every: int, first: int = 0, last: int = 7) -> Fault:
-    """These numbers of the state are renewed with each so manieth only."""
-
-    def report(states: Sequence[State]) -> State:
-        x, old = states[-1].x, states[(len(states) - 1) // every * every].x
-        return replace(states[-1], x=(*x[:first], *old[first:last], *x[last:]))
-
-    return report
-
-
-def late(states: Sequence[State]) -> State:
-    """What was so 0.1 s ago."""
-    return replace(states[-1], x=states[max(len(states) - 6, 0)].x)
-
-
-def dated(by_s: float) -> Fault:
-    return lambda states: replace(states[-1], time_s=states[-1].time_s + by_s)
-
-
-def nought(_: float) -> float:
-    return 0.0
-
-
-def negative(value: float) -> float:
-    return -value
-
-
 EVER = 1000
 # Name: the fault, for how many states it lasts, how many may be believed, whether the car goes on.
-FAULTS: dict[str, tuple[Fault, int, int, bool]] = {
-    "frozen": (held(EVER), EVER, 1, False),
-    "frozen for 2 s": (held(EVER), 100, 1, False),
-    "position frozen": (held(EVER, 0, 3), EVER, 2, False),
-    "jumped by 1 m": (changed(x=lambda x: x + 1), 50, 0, False),
-    "jumped by 0.1 m": (changed(y=lambda y: y - 0.1), EVER, 0, False),
-    "heading turned round": (changed(psi=lambda psi: psi + math.pi), EVER, 0, False),
-    "heading in degrees": (changed(psi=math.degrees), EVER, 1, False),
-    "speed in km/h": (changed(vx=lambda v: 3.6 * v, vy=lambda v: 3.6 * v), EVER, 0, False),
-    "position in mm": (changed(x=lambda x: 1e3 * x, y=lambda y: 1e3 * y), EVER, 0, False),
-    "vx negative for 0.1 s": (changed(vx=negative), 5, 0, True),
-    "vy, omega, delta at 0": (changed(vy=nought, omega=nought, delta=nought), EVER, 3, False),
-    "omega mirrored": (changed(omega=negative), EVER, 3, False),
-    "mirrored": (
-        changed(y=negative, psi=negative, vy=negative, omega=negative, delta=negative),
-        EVER, 0, False,
-    ),
-    "x and y exchanged": (swapped(1, 0, 2, 3, 4, 5, 6), EVER, 0, False),
-    "vx and vy exchanged": (swapped(0, 1, 2, 4, 3, 5, 6), EVER, 0, False),
-    "late by 0.1 s": (late, EVER, 1, False),
-    "dated 0.1 s ahead": (dated(0.1), EVER, 0, True),
-    "every fifth only": (held(5), EVER, 1, False),
-}  # fmt: skip
+FAULTS: dict[str, tuple[StateFault, int, int, bool]] = {
+    name: (STATE_FAULTS[name], EVER, believed, goes_on)
+    for name, believed, goes_on in (
+        ("frozen", 1, False),
+        ("position frozen", 2, False),
+        ("jumped by 0.1 m", 0, False),
+        ("heading turned round", 0, False),
+        ("heading in degrees", 1, False),
+        ("speed in km/h", 0, False),
+        ("position in mm", 0, False),
+        ("vy, omega, delta at 0", 3, False),
+        ("omega mirrored", 3, False),
+        ("mirrored", 0, False),
+        ("x and y exchanged", 0, False),
+        ("vx and vy exchanged", 0, False),
+        ("late by 5 periods", 1, False),
+        ("dated 0.1 s ahead", 0, True),
+        ("every fifth only", 1, False),
+    )
+} | {
+    "frozen for 2 s": (STATE_FAULTS["frozen"], 100, 1, False),
+    "jumped by 1 m": (STATE_FAULTS["jumped by 1 m"], 50, 0, False),
+    "vx negative for 0.1 s": (STATE_FAULTS["vx negative"], 5, 0, True),
+}
 
 
 class Faulty(ClosedLoop):
     """A car whose sensors fail."""
 
-    def fail(self, fault: Fault, lasts: int) -> None:
+    def fail(self, fault: StateFault, lasts: int) -> None:
         self._fault, self._end_s = fault, BEGIN_S + lasts * STEP_S
         self._since: list[State] = []
         self.faults: list[str] = []

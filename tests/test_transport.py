@@ -505,7 +505,7 @@ def test_a_peer_that_polls_sleeps_while_no_answer_can_be_there(
     clock = SimpleNamespace(
         monotonic=lambda: now_s, monotonic_ns=lambda: round(1e9 * now_s), sleep=sleep
     )
-    monkeypatch.setattr(inbox_module, "time", clock)
+    monkeypatch.setattr(inbox_module, "clock", clock)
     sample = SimpleNamespace(payload=SimpleNamespace(to_bytes=lambda: encode(messages.state())))
     session = MagicMock()
     session.declare_subscriber().handler.try_recv = look

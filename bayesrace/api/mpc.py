@@ -24,7 +24,7 @@ __all__ = ["Mpc", "Solution"]
 
 _SOLVER: Final = {
     "tolerance": 1e-6, "defect_max": 0.03, "early_stop_tol": 0.0, "iterations": 10,
-    "iterations_cold": 50,
+    "iterations_cold": 50, "qp_steps": 100_000,
 }  # fmt: skip
 
 
@@ -75,7 +75,7 @@ class Mpc:
 
         ``horizon``: stages, 2 to 100. ``step_s``: length of a stage, that of ``problem.f``.
         ``parameters``: run-time parameters by name. ``solver``: tolerance, defect_max,
-        early_stop_tol, iterations, iterations_cold, as of a controller's settings.
+        early_stop_tol, iterations, iterations_cold, qp_steps, as of a controller's settings.
         ``gp_capacity``: training points of an output of the correction, at most.
 
         InputError names what cannot be used, or what ``problem.f`` and ``problem.advance`` say

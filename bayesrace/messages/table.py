@@ -2,8 +2,9 @@
 and who may send and receive it.
 
 A topic is published; a service is a request with an answer. ``{car}`` and ``{source}`` in a key
-stand for the car's name and the process. Who may do what is said by role: the access control of
-secured links (:mod:`bayesrace.transport.session`) is generated from these columns.
+stand for the car's name and the process, or the name of a shadow. Who may do what is said by role:
+the access control of secured links (:mod:`bayesrace.transport.session`) is generated from these
+columns.
 """
 
 import re
@@ -33,24 +34,26 @@ from bayesrace.messages.types import (
 
 __all__ = [
     "ACTUATION", "ALIVE", "ALIVE_SOURCES", "BRAKING", "COMMAND", "EVENT", "EVERYTHING", "GO_ON",
-    "HEARTBEAT", "HOLD", "RECORDERS", "ROLE_OF", "ROLLBACK", "RUN", "SERVICES", "STATE", "STATUS",
-    "STOP", "TELEMETRY", "TOPICS", "TRUTH", "WEIGHTS", "Qos", "Role", "Service", "Source", "Topic",
-    "car_key", "is_car_name", "topic_of",
+    "HEARTBEAT", "HOLD", "RECORDERS", "ROLE_OF", "ROLLBACK", "RUN", "SERVICES",
+    "SHADOW_ACTUATION", "SHADOW_TELEMETRY", "STATE", "STATUS", "STOP", "TELEMETRY", "TOPICS",
+    "TRUTH", "WEIGHTS", "Qos", "Role", "Service", "Source", "Topic", "car_key", "is_car_name",
+    "topic_of",
 ]  # fmt: skip
 
 M = TypeVar("M", bound=Message)
 A = TypeVar("A", bound=Message)
 
-Source = Literal["plant", "controller", "race", "recorder", "director"]
-"""Part of a process that sends, as named in keys."""
+Source = Literal["plant", "controller", "race", "recorder", "director", "shadow"]
+"""Part of a process that sends, as named in keys; a shadow has a name of its own there."""
 
-Role = Literal["plant", "controller", "learning", "director", "viewer", "router"]
-"""What a process may do. Learning sends weights, a director does that and commands and records, a
-viewer looks on, a router forwards for the others."""
+Role = Literal["plant", "controller", "shadow", "learning", "director", "viewer", "router"]
+"""What a process may do. A shadow decides as a controller does, and drives nothing; learning sends
+weights, a director does that and commands and records, a viewer looks on, a router forwards for the
+others."""
 
 ROLE_OF: Final[dict[Source, Role]] = {
     "plant": "plant", "controller": "controller", "race": "director", "recorder": "director",
-    "director": "director",
+    "director": "director", "shadow": "shadow",
 }  # fmt: skip
 
 _CAR_NAME = re.compile(r"[A-Za-z0-9_-]{1,40}")
@@ -114,16 +117,16 @@ _NEWS: Final = Qos("data", express=True, realtime_blocks=True)
 _WATCHING: Final[tuple[Role, ...]] = ("learning", "director", "viewer")
 
 STATE: Final = Topic(
-    "state", "bayesrace/{car}/state", State, ("plant",), ("controller", *_WATCHING),
-    "each period (50 Hz by default)", _CONTROL,
+    "state", "bayesrace/{car}/state", State, ("plant",),
+    ("controller", "shadow", *_WATCHING), "each period (50 Hz by default)", _CONTROL,
 )  # fmt: skip
 TRUTH: Final = Topic(
     "truth", "bayesrace/{car}/truth", Truth, ("plant",), ("director", "viewer"), "each state",
     _REPORT,
 )  # fmt: skip
 ACTUATION: Final = Topic(
-    "actuation", "bayesrace/{car}/actuation", Actuation, ("controller",), ("plant", *_WATCHING),
-    "each cycle", _CONTROL,
+    "actuation", "bayesrace/{car}/actuation", Actuation, ("controller",),
+    ("plant", "shadow", *_WATCHING), "each cycle", _CONTROL,
 )  # fmt: skip
 TELEMETRY: Final = Topic(
     "telemetry", "bayesrace/{car}/telemetry", Telemetry, ("controller",), _WATCHING, "each cycle",
@@ -145,8 +148,17 @@ HOLD: Final = Topic(
     "hold", "bayesrace/{car}/hold", Hold, ("director",), ("plant", "controller"),
     "20 Hz in a held run", _CONTROL,
 )  # fmt: skip
+SHADOW_ACTUATION: Final = Topic(
+    "shadow_actuation", "bayesrace/{car}/shadow/{source}/actuation", Actuation, ("shadow",),
+    ("director", "viewer"), "each actuation of the controller, which alone is carried out", _REPORT,
+)  # fmt: skip
+SHADOW_TELEMETRY: Final = Topic(
+    "shadow_telemetry", "bayesrace/{car}/shadow/{source}/telemetry", Telemetry, ("shadow",),
+    ("director", "viewer"), "the same", _REPORT,
+)  # fmt: skip
 TOPICS: Final[tuple[Topic[Any], ...]] = (
-    STATE, TRUTH, ACTUATION, BRAKING, TELEMETRY, EVENT, HEARTBEAT, HOLD
+    STATE, TRUTH, ACTUATION, BRAKING, TELEMETRY, EVENT, HEARTBEAT, HOLD, SHADOW_ACTUATION,
+    SHADOW_TELEMETRY,
 )  # fmt: skip
 
 RUN: Final = Service(
@@ -196,7 +208,8 @@ EVERYTHING: Final = "bayesrace/{car}/**"
 RECORDERS: Final[tuple[Role, ...]] = ("director", "viewer")
 """Who may."""
 
-_BY_PREFIX: Final = {topic.key.split("/")[2]: topic for topic in TOPICS}
+_FIXED: Final = {tuple(topic.key.split("/")[2::2]): topic for topic in TOPICS}
+"""By the parts of their keys that stand for nothing else."""
 
 
 def is_car_name(name: str) -> bool:
@@ -218,7 +231,9 @@ def car_key(template: str, car: str, source: str = "") -> str:
 def topic_of(key: str) -> Topic[Any] | None:
     """The table's row for a key such as ``bayesrace/orca/state``; None for any other key."""
     parts = key.split("/")
-    topic = _BY_PREFIX.get(parts[2]) if len(parts) > 2 and parts[0] == "bayesrace" else None
+    topic = _FIXED.get(tuple(parts[2::2])) if parts[0] == "bayesrace" else None
     if topic is None or len(parts) != len(topic.key.split("/")):
         return None
-    return topic if len(parts) == 3 or parts[3] in topic.sources else None
+    if len(parts) == 3 or parts[3] in topic.sources:
+        return topic
+    return topic if topic.sources == ("shadow",) and is_car_name(parts[3]) else None

@@ -71,6 +71,7 @@ Calendar = Annotated[float, Meta(ge=0.0, le=1e11)]
 Delay = Annotated[float, Meta(ge=0.0, le=1e3)]
 Number = Annotated[float, Meta(ge=-1e6, le=1e6)]
 Width = Annotated[float, Meta(ge=0.0, le=1e3)]
+Refusals = Annotated[tuple[Annotated[int, Meta(ge=0, le=1_000_000)], ...], Meta(max_length=16)]
 Measure = Annotated[float, Meta(ge=-1.0, le=1e12)]
 Short = Annotated[str, Meta(max_length=200)]
 Long = Annotated[str, Meta(max_length=2000)]
@@ -290,6 +291,19 @@ class Telemetry(Message, frozen=True, kw_only=True, tag=6):
     state was measured as a whole, or nothing is known yet."""
     deviation: Annotated[tuple[Number, ...], _vector(*ESTIMATED, rows=1)]
     """Standard deviations of the estimate."""
+    states: Annotated[int, Meta(ge=-1, le=1_000_000)] = -1
+    """States that the controller has taken since the cycle before; -1: not reported (as all below
+    in recordings of earlier releases)."""
+    late_s: Seconds = 0.0
+    """How much later than its budget the decision was made."""
+    refused: Refusals = ()
+    """Where the step's budget ran out: the numbers of the step's questions whether there is time
+    left that were answered no (br_mpc_get_refusals in controller/native/bayesrace_mpc.h)."""
+    prepared_s: Annotated[float, Meta(ge=-1.0, le=1e6)] = -1.0
+    """In how long the preparation before this cycle expected it; 0: there was none; -1: not
+    reported."""
+    prepared_refused: Refusals = ()
+    """Where the preparation's budget ran out, as ``refused``."""
 
     def __post_init__(self) -> None:
         if len(self.plan_x) % len(QUANTITIES) or len(self.plan_u) % len(_INPUT):

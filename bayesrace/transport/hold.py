@@ -1,8 +1,8 @@
 """The dead man's switch of a held run: what notices that its director is missing."""
 
-import time
 from typing import Any, Final
 
+from bayesrace import clock
 from bayesrace.messages import HOLD, Decoder, car_key
 from bayesrace.transport.requests import in_transport_thread
 
@@ -40,7 +40,7 @@ class HoldWatch:
     def follow(self, run: tuple[int, int], required: bool = False) -> None:
         """Watch another run, given by epoch and number. It is held from its first message on, or,
         ``required``, from now on."""
-        self.run, self._since_ns = run, time.monotonic_ns() if required else 0
+        self.run, self._since_ns = run, clock.monotonic_ns() if required else 0
         self._heard = (0, 0), 0
 
     @property
@@ -48,10 +48,10 @@ class HoldWatch:
         """Whether the run is held, and its director has not been heard for half a second."""
         run, heard_ns = self._heard
         newest_ns = heard_ns if run == self.run else self._since_ns
-        return newest_ns > 0 and time.monotonic_ns() - newest_ns > _HOLD_S * 1e9
+        return newest_ns > 0 and clock.monotonic_ns() - newest_ns > _HOLD_S * 1e9
 
     def _note(self, sample: Any) -> None:
-        now_ns, run = time.monotonic_ns(), self.run
+        now_ns, run = clock.monotonic_ns(), self.run
         hold = self.decoder(sample.payload.to_bytes())
         if hold is None or (hold.epoch, hold.run) != run:
             return

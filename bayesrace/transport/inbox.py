@@ -22,6 +22,7 @@ from typing import Any, Final, NamedTuple, TypeVar
 
 import zenoh
 
+from bayesrace import clock
 from bayesrace.messages import ALIVE, Decoder, Message, Service, Topic, car_key
 from bayesrace.processes import catching_signals
 from bayesrace.transport.endpoints import Endpoints
@@ -257,7 +258,7 @@ class Inbox:
     def receive_signals(self) -> AbstractContextManager[None]:
         """For the block, SIGINT and SIGTERM arrive as items; no effect off the main thread."""
         return catching_signals(
-            lambda number: self.put(Item(Kind.SIGNAL, "", number, time.monotonic_ns()))
+            lambda number: self.put(Item(Kind.SIGNAL, "", number, clock.monotonic_ns()))
         )
 
     def put(self, item: Item) -> None:
@@ -270,24 +271,24 @@ class Inbox:
             self._empty_channels()
         if self._stamping or not self._channels:
             return self._from_queue(timeout_s)
-        begin, misses, rested_s = time.monotonic(), 0, 0.0
+        begin, misses, rested_s = clock.monotonic(), 0, 0.0
         while (item := self._in_turn()) is None:
-            waited_s, misses = time.monotonic() - begin, misses + 1
+            waited_s, misses = clock.monotonic() - begin, misses + 1
             if waited_s >= timeout_s:
                 return None
             if misses == 1 and self.spin_s and self._expected_s > _AHEAD_S:
                 rested_s = min(self._expected_s - _AHEAD_S, timeout_s)
-                time.sleep(rested_s)
+                clock.sleep(rested_s)
             elif waited_s - rested_s < self.spin_s:
                 os.sched_yield()  # the thread that receives may be waiting for this very CPU
             else:
                 sleep_s = min(max(_SHARE * waited_s, POLL_S), _IDLE_S)
-                time.sleep(min(sleep_s, timeout_s - waited_s))
+                clock.sleep(min(sleep_s, timeout_s - waited_s))
         if misses and self.spin_s and item.kind is Kind.MESSAGE:
             if misses == 1 and rested_s:
                 self._expected_s *= _SOONER
             else:
-                self._expected_s = min(time.monotonic() - begin, self._expected_s + _LATER)
+                self._expected_s = min(clock.monotonic() - begin, self._expected_s + _LATER)
         return item
 
     def poll(self, until_ns: int) -> Item | None:
@@ -298,9 +299,9 @@ class Inbox:
         least once.
         """
         while (item := self._from_channels()) is None:
-            if time.monotonic_ns() >= until_ns:
+            if clock.monotonic_ns() >= until_ns:
                 return None
-            time.sleep(POLL_S)
+            clock.sleep(POLL_S)
         return item
 
     @property
@@ -351,7 +352,7 @@ class Inbox:
                 return False
             if service.shared:
                 self._shared[service.name] = request
-            item = Item(Kind.REQUEST, service.name, request, time.monotonic_ns())
+            item = Item(Kind.REQUEST, service.name, request, clock.monotonic_ns())
             requests.append(item)
         self.put(item)
         return True
@@ -366,7 +367,7 @@ class Inbox:
     def _offer(self, kind: Kind, name: str, value: Any, key: str = "") -> None:
         """In the transport's thread: another process must not fill the memory."""
         if self._queue.qsize() < self._capacity:
-            self._queue.put(Item(kind, name, value, time.monotonic_ns(), key))
+            self._queue.put(Item(kind, name, value, clock.monotonic_ns(), key))
         else:
             self.overflowed += 1
 
@@ -394,7 +395,7 @@ class Inbox:
             channels.rotate(-1)
             sample = channel.try_recv()
             if sample is not None:
-                now_ns = time.monotonic_ns()
+                now_ns = clock.monotonic_ns()
                 message = channel.decoder(sample.payload.to_bytes())
                 return Item(Kind.MESSAGE, channel.name, message, now_ns)
         return None

@@ -1,7 +1,6 @@
 """Topics with the table's quality of service, and a process's heartbeat."""
 
 import os
-import time
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
@@ -9,6 +8,7 @@ from typing import Any, Final, Generic, Literal, TypeVar
 
 import zenoh
 
+from bayesrace import clock
 from bayesrace.defaults import HEARTBEAT_VARIABLE
 from bayesrace.errors import InputError
 from bayesrace.messages import HEARTBEAT, Message, Status, Topic, car_key, encode
@@ -58,7 +58,7 @@ class Publisher(Generic[M]):
         """
         (self._lockstep if lockstep else self._realtime).put(encode(message))
         self.next_seq = message.seq + 1
-        self.sent_ns = time.monotonic_ns()
+        self.sent_ns = clock.monotonic_ns()
 
 
 class Heartbeat:
@@ -82,7 +82,7 @@ class Heartbeat:
 
     def beat(self, status: Callable[[int], Status]) -> None:
         """Publish ``status(seq)`` if it is due."""
-        now_ns = time.monotonic_ns()
+        now_ns = clock.monotonic_ns()
         if now_ns < self._due_ns:
             return
         # On a grid, so that a loop's jitter does not slow it; a new grid after a stall.

@@ -57,8 +57,8 @@ __all__ = [
 
 _log = logging.getLogger("bayesrace.links")
 
-_REGIONS: Final = ("plant", "controller", "observer")
-"""Zenoh region of a process; an observer is any other process than plant and controller. A router
+_REGIONS: Final = ("plant", "controller", "shadow", "observer")
+"""Zenoh region of a process; an observer is any process but these. A router
 forwards between regions only, which suffices: processes of one region exchange no messages."""
 
 # One receiving worker hands over between threads less often than the default of two.
@@ -433,7 +433,9 @@ def _rights(role: Role) -> Iterator[tuple[str, str]]:
     """What a process of this role may do, and the key for any car."""
 
     def own(key: str, sources: Iterable[Source]) -> Iterator[str]:
-        return (key.replace("{source}", one) for one in sources if ROLE_OF[one] == role)
+        named = {"shadow": "*"}  # by its user
+        ours = (one for one in sources if ROLE_OF[one] == role)
+        return (key.replace("{source}", named.get(one, one)) for one in ours)
 
     for topic in TOPICS:
         yield from (("sends", key) for key in own(topic.key, topic.sources))

@@ -50,6 +50,8 @@ _SOLVER: Final = (
      "SQP iterations a step without budget may use, once the defect is below 0.01"),
     ("iterations_cold", _COUNT,
      "the same for the first step after a reset; with a budget the larger limits every step"),
+    ("qp_steps", _COUNT | {"min": 200, "max": 1_000_000},
+     "active-set steps that all QPs of a step may take together"),
 )  # fmt: skip
 """BR_SOLVER_FIELDS in controller/native/bayesrace_mpc.h: name, bounds, meaning."""
 

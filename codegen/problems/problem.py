@@ -26,6 +26,7 @@ __all__ = [
 
 _TAKEN: Final = {
     "tolerance", "defect_max", "early_stop_tol", "iterations", "iterations_cold", "caution_sigmas",
+    "qp_steps",
 }  # fmt: skip
 """Names beside the problem's in br_mpc_parameters, controller/native/bayesrace_mpc.h."""
 

@@ -240,8 +240,18 @@ BR_API br_mpc_error br_cycle_decide(br_cycle *cycle, const br_environment *envir
                                     double decided_at_s, double budget_s, double spent_s,
                                     br_decision *decision);
 
+/* What another controller has sent, which drives while this one only decides: it acts in place of
+ * what this one has decided at that plant time, or beside it. */
+BR_API void br_cycle_sent(br_cycle *cycle, double decided_at_s, const double u[BR_NU]);
+
 /* br_mpc_prepare for a state that is expected a period after the last one, where one is. */
 BR_API void br_cycle_prepare(br_cycle *cycle, double period_s, double budget_s);
+
+/* For replaying what was driven in real time: br_mpc_get_refusals of the compiled controller, which
+ * are none of another; and br_mpc_repeat for the next br_cycle_decide or br_cycle_prepare, which
+ * is late by spent_s - budget_s alone, however long it takes. */
+BR_API int br_cycle_get_refusals(const br_cycle *cycle, int refused[BR_REFUSALS]);
+BR_API br_mpc_error br_cycle_repeat(br_cycle *cycle, const int *refused, int count);
 
 /* What the car's guard shall do if no actuation comes any more: the newest input, then the plan for
  * as long as the fallback drives on it, then braking along the line to standstill. To be sent after

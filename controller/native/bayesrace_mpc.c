@@ -77,7 +77,8 @@ static int valid(const br_mpc_parameters *p) {
     const double numbers[] = {p->tolerance, p->defect_max, p->early_stop_tol, p->caution_sigmas};
     return br_all_finite(numbers, sizeof numbers / sizeof numbers[0]) && p->tolerance > 0 &&
            p->defect_max > 0 && p->early_stop_tol >= 0 && p->caution_sigmas >= 0 &&
-           p->iterations >= 1 && p->iterations_cold >= 1 && br_valid_parameters(p);
+           p->iterations >= 1 && p->iterations_cold >= 1 && p->qp_steps >= BR_QP_STEPS &&
+           br_valid_parameters(p);
 }
 
 static void limit_speeds(br_mpc *mpc);
@@ -119,6 +120,21 @@ br_mpc_error br_mpc_set_path(br_mpc *mpc, const double *table, int n, double spa
 br_mpc_error br_mpc_set_clock(br_mpc *mpc, br_mpc_clock clock, void *context) {
     if (!mpc) return BR_ERROR_NULL;
     mpc->timer = (br_timer){.clock = clock, .context = context};
+    return BR_OK;
+}
+
+int br_mpc_get_refusals(const br_mpc *mpc, int refused[BR_REFUSALS]) {
+    if (!mpc || !refused) return 0;
+    memcpy(refused, mpc->timer.refused, sizeof mpc->timer.refused);
+    return mpc->timer.refusals;
+}
+
+br_mpc_error br_mpc_repeat(br_mpc *mpc, const int *refused, int count) {
+    if (!mpc || (!refused && count)) return BR_ERROR_NULL;
+    if (count < 0 || count > BR_REFUSALS) return BR_ERROR_PARAMETERS;
+    mpc->timer.given = count;
+    for (int i = 0; i < count; ++i) mpc->timer.refuse[i] = refused[i];
+    mpc->timer.told = 1;
     return BR_OK;
 }
 
@@ -439,7 +455,7 @@ const char *br_mpc_status_text(br_mpc_status status) {
         [BR_QP_LIMIT] = "QP iteration limit",
         [BR_NOT_FINITE] = "not finite",
         [BR_BAD_STATE] = "bad state",
-        [BR_TIME_LIMIT] = "out of time before the plan was usable",
+        [BR_TIME_LIMIT] = "out of time or QP steps before the plan was usable",
     };
     return (unsigned)status < sizeof texts / sizeof texts[0] ? texts[status] : "unknown status";
 }

@@ -31,11 +31,14 @@
 extern "C" {
 #endif
 
-#define BR_SECOND_START_ITERATIONS 12 /* at most; most often it needs eight */
 /* A step without a plan tries up to BR_COLD_GUESSES guesses; each after the first gets at most
  * BR_SECOND_START_ITERATIONS. If none gives a usable plan, the problem is solved without its soft
  * rows, and from that result with them; each of the two gets as many again. */
-#define BR_COLD_GUESSES 4
+enum {
+    BR_COLD_GUESSES = 4,
+    BR_SECOND_START_ITERATIONS = 12, /* at most; most often it needs eight */
+    BR_QP_STEPS = 200                /* of the active-set method in one QP, at most */
+};
 #define BR_NV (BR_NX + BR_NU) /* stage variables v = [x; u] */
 #define BR_PATH_COLUMNS 7     /* see br_mpc_set_path */
 #define BR_PATH_CAPACITY 8192 /* points of the path table */
@@ -75,7 +78,7 @@ typedef enum {
     BR_QP_LIMIT,      /* the QP solver hit its iteration limit or cycled */
     BR_NOT_FINITE,    /* a number in the problem or its solution is not finite */
     BR_BAD_STATE,     /* the measured state is not finite or absurd; nothing was solved */
-    BR_TIME_LIMIT     /* the budget was used up before the plan was usable */
+    BR_TIME_LIMIT     /* the budget or qp_steps were used up before the plan was usable */
 } br_mpc_status;
 
 /* Instruction sets that a library has code for. */
@@ -96,7 +99,9 @@ typedef enum {
     WHOLE(iterations)      /* SQP iterations a step without budget may use, once the defect \
                             * is below 0.01; at least 1 */                                  \
     WHOLE(iterations_cold) /* the same for the first step after a reset; with a budget the  \
-                            * larger limits every step */
+                            * larger limits every step */                                   \
+    WHOLE(qp_steps)        /* of the active-set method, at most, in all QPs of a step, and  \
+                            * of a preparation; at least BR_QP_STEPS */
 
 #define BR_REAL_MEMBER(name) double name;
 #define BR_WHOLE_MEMBER(name) int name;
@@ -125,7 +130,7 @@ typedef struct {
     int shifts;              /* stages by which the plan was shifted; -1: there was no plan */
     int prepared;            /* 1: br_mpc_prepare had linearised and factorised already */
     int prepared_iterations; /* SQP iterations of br_mpc_prepare since the step before */
-    int time_limited;        /* 1: the budget ended the iterations */
+    int time_limited;        /* 1: the budget or qp_steps ended the iterations */
     double stationarity;     /* scaled infinity norms at the returned plan: of the gradient, */
     double defect;           /* of the dynamics, */
     double bound;            /* of the hard constraints */
@@ -261,6 +266,16 @@ BR_API br_mpc_error br_mpc_get_samples(const br_mpc *mpc, double features[BR_SAM
  * from within br_mpc_step, br_mpc_solve and br_mpc_prepare only, in their thread. */
 BR_API br_mpc_error br_mpc_set_clock(br_mpc *mpc, br_mpc_clock clock, void *context);
 
+/* Where time ran out, for replaying what was driven in real time. A call with a budget asks its
+ * clock several times whether what comes next still fits. The refusals, the numbers of the
+ * questions (from 0 on) that were answered no, are all that a clock changes: another call with the
+ * same arguments and refusals gives the same result to the bit. br_mpc_get_refusals returns how
+ * many there were in the newest br_mpc_step, br_mpc_solve or br_mpc_prepare, the first BR_REFUSALS
+ * counted; br_mpc_repeat has the next call with a budget refuse these in place of the clock. */
+enum { BR_REFUSALS = 16 };
+BR_API int br_mpc_get_refusals(const br_mpc *mpc, int refused[BR_REFUSALS]);
+BR_API br_mpc_error br_mpc_repeat(br_mpc *mpc, const int *refused, int count);
+
 /* A clock for hosts that have none of their own: the system's monotonic one. context is unused.
  * Alone in br_clock.c, which a system without it leaves out. */
 BR_API double br_mpc_monotonic(void *context);
@@ -292,9 +307,10 @@ BR_API void br_mpc_reset(br_mpc *mpc);
  * budget_s: time from the call within which it should return; needs a clock. The step then
  * iterates until an early stop (early_stop_tol 0: until converged) or as long as another iteration,
  * at the longest duration seen, fits, and returns the best usable plan. The first iteration is
- * always done. Without a clock or with budget_s <= 0 the iteration limits alone count. Either way
- * an iteration that fails does not take back a usable plan found before it. After BR_TIME_LIMIT the
- * next step goes on from where this one stopped. */
+ * always done. Without a clock or with budget_s <= 0 the iteration limits and qp_steps alone count,
+ * which bound the work of a step: docs/timing.md has the product. Either way an iteration that
+ * fails does not take back a usable plan found before it. After BR_TIME_LIMIT the next step goes on
+ * from where this one stopped. */
 BR_API br_mpc_error br_mpc_step(br_mpc *mpc, const double x[BR_NX], const double u_before[BR_NU],
                                 const br_environment *environment, double elapsed_s,
                                 double budget_s, double u[BR_NU], br_mpc_status *status,

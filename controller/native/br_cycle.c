@@ -35,6 +35,7 @@ struct br_cycle {
     int halted;           /* the phase of a car that is not to be driven; 0: drive */
     int stopping;         /* a stop has begun: since, from which speed */
     double stopping_s, stopping_mps;
+    int repeats; /* the next decision takes no time: br_cycle_repeat */
     int stepped; /* a step has been made, for that moment */
     double stepped_s;
     double vx_mps; /* the newest that is known */
@@ -504,7 +505,8 @@ static void drive(br_cycle *cycle, const br_environment *environment, double act
         const double left_s = fmax(budget_s - spent_s, LEAST_BUDGET * budget_s);
         decision->status = step(cycle, environment, acting_s, budget_s > 0 ? left_s : 0);
     }
-    if (budget_s > 0) decision->late_s = spent_s + now(cycle) - begin_s - budget_s;
+    const double took_s = cycle->repeats ? 0 : now(cycle) - begin_s;
+    if (budget_s > 0) decision->late_s = spent_s + took_s - budget_s;
     decision->level = br_fallback_decide(&cycle->fallback, &cycle->settings,
                                          decision->status ? NULL : &cycle->solution, cycle->vx_mps,
                                          acting_s, fmax(decision->late_s, 0), decision->u);
@@ -543,8 +545,25 @@ br_mpc_error br_cycle_decide(br_cycle *cycle, const br_environment *environment,
     else
         drive(cycle, &around, acting_s, budget_s, spent_s);
     br_delay_sent(&cycle->delay, decided_at_s, decision->u);
+    cycle->repeats = 0;
     *out = *decision;
     return BR_OK;
+}
+
+void br_cycle_sent(br_cycle *cycle, double decided_at_s, const double u[BR_NU]) {
+    if (!cycle || !u || !isfinite(decided_at_s)) return;
+    br_delay_replace(&cycle->delay, decided_at_s, u);
+    memcpy(cycle->decision.u, u, sizeof cycle->decision.u);
+}
+
+int br_cycle_get_refusals(const br_cycle *cycle, int refused[BR_REFUSALS]) {
+    return cycle && cycle->mpc ? br_mpc_get_refusals(cycle->mpc, refused) : 0;
+}
+
+br_mpc_error br_cycle_repeat(br_cycle *cycle, const int *refused, int count) {
+    if (!cycle) return BR_ERROR_NULL;
+    cycle->repeats = 1;
+    return cycle->mpc ? br_mpc_repeat(cycle->mpc, refused, count) : BR_OK;
 }
 
 br_mpc_error br_cycle_brake(const br_cycle *cycle, br_braking *braking) {

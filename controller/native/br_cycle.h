@@ -51,6 +51,7 @@ typedef struct {
 void br_delay_observe(br_delay *delay, const br_driving *settings, const br_measured *state,
                       double *delay_s);
 void br_delay_sent(br_delay *delay, double decided_at_s, const double u[BR_NU]);
+void br_delay_replace(br_delay *delay, double decided_at_s, const double u[BR_NU]);
 
 /* What acts at a plant time; NULL: not known. */
 const double *br_delay_acting(br_delay *delay, double time_s, double delay_s);

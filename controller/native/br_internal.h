@@ -190,14 +190,18 @@ typedef struct {
     BR_ALIGNED double correlations[BR_GP_ROOT][BR_COLUMNS];
 } br_caution;
 
-/* Time within a call, by the host's clock. */
+/* Time within a call, by the host's clock, and steps of its QPs. */
 typedef struct {
     br_mpc_clock clock; /* NULL: none */
     void *context;
     int limited; /* there is a deadline */
     double deadline;
+    int qp_steps;            /* left */
     double iteration, trial; /* longest seen, of the line search's trials too; 0: none yet */
     double caution;          /* what the last br_caution_update took */
+    int checks, refusals, refused[BR_REFUSALS]; /* of the newest call: see br_mpc_get_refusals */
+    int told, repeats;                          /* br_mpc_repeat was called; it counts now */
+    int given, refuse[BR_REFUSALS];
 } br_timer;
 
 /* What is computed from the plan, the weights and a call's arguments, and kept while these stay.
@@ -360,9 +364,19 @@ static inline double br_timer_now(const br_timer *timer) {
     return timer->clock ? timer->clock(timer->context) : 0;
 }
 
-/* Whether what takes that long fits; a clock that gives NaN never lets anything begin. */
-static inline int br_timer_allows(const br_timer *timer, double now, double duration) {
-    return !timer->limited || timer->deadline - now >= duration;
+/* Whether what takes that long fits, and QPs may take steps yet; a clock that gives NaN never lets
+ * anything begin. */
+static inline int br_timer_allows(br_timer *timer, double now, double duration) {
+    if (timer->qp_steps <= 0) return 0;
+    if (!timer->limited) return 1;
+    const int number = timer->checks++;
+    int allows = timer->deadline - now >= duration;
+    if (timer->repeats) {
+        allows = 1;
+        for (int i = 0; i < timer->given; ++i) allows &= timer->refuse[i] != number;
+    }
+    if (!allows && timer->refusals < BR_REFUSALS) timer->refused[timer->refusals++] = number;
+    return allows;
 }
 
 static inline void br_timer_note(const br_timer *timer, double begin, double *longest) {

@@ -33,7 +33,6 @@ void br_qp_init(br_qp *qp) {
         .pivot_tol = DEFAULT_PIVOT_TOL,
         .progress_tol = DEFAULT_PROG_TOL,
         .cycle_tol = DEFAULT_CYCLE_TOL,
-        .iter_limit = 200,
         .fval_bound = DAQP_INF,
         .rho_soft = DEFAULT_RHO_SOFT,
     };
@@ -315,7 +314,10 @@ static void fill_least_distance(br_mpc *mpc) {
     fill_rows(qp, BR_ROW_LATE, BR_ROWS);
 }
 
-static int run_daqp(br_qp *qp) {
+/* With the steps that are left to this QP. */
+static int run_daqp(br_mpc *mpc) {
+    br_qp *qp = &mpc->qp;
+    br_timer *timer = &mpc->timer;
     const double weight = slack_weight(qp);
     DAQPWorkspace *work = &qp->daqp;
     work->m = BR_ROWS;
@@ -325,7 +327,13 @@ static int run_daqp(br_qp *qp) {
     qp->settings.rho_soft = weight > 0 ? 1.0 / (2 * weight) : 0.0;
     reset_daqp_workspace(work);
     activate_constraints(work);
-    return daqp_ldp(work);
+    const int most = timer->qp_steps < BR_QP_STEPS ? timer->qp_steps : BR_QP_STEPS;
+    qp->settings.iter_limit = most;
+    const int flag = daqp_ldp(work);
+    const int steps = work->iterations < most ? work->iterations : most; /* it counts one more */
+    timer->qp_steps -= steps;
+    mpc->info.qp_iterations += steps;
+    return flag;
 }
 
 /* dU = L^{-T} (u - v) and the multipliers in the QP's units. */
@@ -359,14 +367,13 @@ br_mpc_status br_qp_solve(br_mpc *mpc, int warm) {
     if (!br_all_finite(qp->dupper, BR_ROWS) || !br_all_finite(qp->dlower, BR_ROWS))
         return BR_NOT_FINITE;
     if (!warm) br_qp_forget_working_set(qp);
-    int flag = run_daqp(qp);
-    mpc->info.qp_iterations += qp->daqp.iterations;
+    int flag = run_daqp(mpc);
     if (flag < 0 && warm) { /* once more without the old working set before giving up */
         br_qp_forget_working_set(qp);
-        flag = run_daqp(qp);
-        mpc->info.qp_iterations += qp->daqp.iterations;
+        flag = run_daqp(mpc);
     }
     if (flag == EXIT_INFEASIBLE) return BR_INFEASIBLE;
+    if (flag == EXIT_ITERLIMIT && qp->settings.iter_limit < BR_QP_STEPS) return BR_TIME_LIMIT;
     if (flag < 0) return BR_QP_LIMIT;
     recover(qp);
     if (!br_all_finite(qp->delta_u, BR_M) || !br_all_finite(qp->multiplier, BR_ROWS))

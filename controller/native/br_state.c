@@ -409,6 +409,13 @@ void br_delay_sent(br_delay *delay, double decided_at_s, const double u[BR_NU]) 
     memcpy(one->u, u, sizeof one->u);
 }
 
+/* In place of what was noted for that time, or for a later one. */
+void br_delay_replace(br_delay *delay, double decided_at_s, const double u[BR_NU]) {
+    while (delay->count && sent(delay, delay->count - 1)->decided_at_s >= decided_at_s)
+        delay->count -= 1;
+    br_delay_sent(delay, decided_at_s, u);
+}
+
 const double *br_delay_acting(br_delay *delay, double time_s, double delay_s) {
     for (int i = delay->count - 1; i >= 0; --i) {
         const br_sent *one = sent(delay, i);

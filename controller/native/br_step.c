@@ -8,9 +8,14 @@ static int iteration_limit(const br_mpc *mpc) {
     return p->iterations > p->iterations_cold ? p->iterations : p->iterations_cold;
 }
 
-static void start_timer(br_timer *timer, double budget) {
+static void start_timer(br_mpc *mpc, double budget) {
+    br_timer *timer = &mpc->timer;
+    timer->qp_steps = mpc->parameters.qp_steps;
     timer->limited = timer->clock && budget > 0;
     timer->deadline = timer->limited ? br_timer_now(timer) + budget : 0;
+    timer->checks = timer->refusals = 0;
+    timer->repeats = timer->limited && timer->told;
+    timer->told &= !timer->limited;
 }
 
 /* --- the plan in step with time --- */
@@ -105,8 +110,8 @@ static int rough(const br_mpc *mpc, br_mpc_status status) {
     return status == BR_DEFECT || mpc->info.defect > BR_DEFECT_FINE;
 }
 
-/* Iterates until an early stop or out of time. What is rough yet may take as many iterations as a
- * cold start. */
+/* Iterates until an early stop or out of time or QP steps. What is rough yet may take as many
+ * iterations as a cold start. A QP that is cut off leaves the plan as it was. */
 static br_mpc_status iterate(br_mpc *mpc, int warm, int most) {
     br_timer *timer = &mpc->timer;
     const int limit = timer->limited || !warm ? most : mpc->parameters.iterations;
@@ -118,7 +123,13 @@ static br_mpc_status iterate(br_mpc *mpc, int warm, int most) {
             mpc->info.time_limited = 1;
             break;
         }
+        const br_mpc_status before = status;
         status = br_sqp_iterate(mpc, i > 0 || warm, i == 0 && warm);
+        if (status == BR_TIME_LIMIT) {
+            mpc->info.time_limited = 1;
+            status = before;
+            break;
+        }
         if (i == 0 && warm) br_plan_keep(mpc, status, &mpc->once);
         br_incumbent_keep(mpc, status, timer->limited);
         if (status != BR_ACCEPTABLE && status != BR_DEFECT) break;
@@ -296,7 +307,7 @@ static br_mpc_error begin(br_mpc *mpc, const double *x, const double *u_before, 
                           double budget_s, const double *u, br_mpc_status *status,
                           br_mpc_info *info, int *plausible) {
     if (!x || !u_before || !u || !status) return BR_ERROR_NULL;
-    start_timer(&mpc->timer, budget_s);
+    start_timer(mpc, budget_s);
     *status = BR_BAD_STATE; /* until there is something better to say */
     memset(&mpc->info, 0, sizeof mpc->info);
     mpc->info.status = BR_BAD_STATE;
@@ -418,7 +429,7 @@ static void foresee(br_mpc *mpc, double elapsed, int shifts) {
 
 /* Iterations at the problem at hand, towards tolerance. Returns whether there may be time left. */
 static int improve(br_mpc *mpc, int shifts) {
-    const br_timer *timer = &mpc->timer;
+    br_timer *timer = &mpc->timer;
     memset(&mpc->info, 0, sizeof mpc->info);
     mpc->penalty = 0;
     if (shifts) br_caution_update(mpc); /* else it is that of the last step */
@@ -464,10 +475,10 @@ static void look_elsewhere(br_mpc *mpc) {
  * real-time iteration (Nurkanovic, Zanelli, Albrecht, Diehl, "The advanced step real time iteration
  * for NMPC", 2019). */
 static void solve_ahead(br_mpc *mpc, double elapsed, int shifts) {
-    const br_timer *timer = &mpc->timer;
-    if (mpc->turn) return;               /* its reference is made from the measured state */
-    if (!(timer->iteration > 0)) return; /* no step has shown yet how long one takes */
-    const double needed = iteration_and_rest(timer) + (shifts ? timer->caution : 0);
+    br_timer *timer = &mpc->timer;
+    if (mpc->turn) return; /* its reference is made from the measured state */
+    double needed = iteration_and_rest(timer) + (shifts ? timer->caution : 0);
+    if (!(timer->iteration > 0)) needed = INFINITY; /* no step has shown yet how long one takes */
     if (!br_timer_allows(timer, br_timer_now(timer), needed)) return;
     if (!mpc->valid[BR_LINEARISATION]) br_linearise_plan(mpc);
     double x0[BR_NX], u_before[BR_NU];
@@ -487,7 +498,7 @@ static void solve_ahead(br_mpc *mpc, double elapsed, int shifts) {
 }
 
 static br_mpc_error br_prepare(br_mpc *mpc, double elapsed_s, double budget_s) {
-    start_timer(&mpc->timer, budget_s);
+    start_timer(mpc, budget_s);
     if (!mpc->has_parameters) return BR_ERROR_NOT_READY;
     if (!(elapsed_s >= 0 && isfinite(elapsed_s))) return BR_ERROR_TIME;
     br_watch_update(mpc);

@@ -264,7 +264,9 @@ class WeightUpdateManager:
 
     def _enter(self, cycle: int, ruling: Ruling) -> None:
         in_use = self._history.in_use
-        known: _Data = {"version": in_use.version, "number": in_use.number}
+        known: _Data = {
+            "version": in_use.version, "number": in_use.number, "cycle": cycle,
+        }  # fmt: skip
         if ruling.action == "slow":
             limit_mps = self.adoption.slow.speed_limit_mps if self.adoption.slow else 0.0
             text = f"at most {limit_mps:.2f} m/s until other weights are in use"

@@ -3,7 +3,7 @@ whether a run did what was asked, by the truth and by what drove the car."""
 
 import hashlib
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -46,6 +46,9 @@ _DRIVEN: Final = 0.5
 
 _HELD_S: Final = 0.1
 """An input drives until the next one, and no longer than this."""
+
+_LISTED: Final = 20
+"""Lap times that a verdict lists; of more it gives the shortest and the longest."""
 
 _AT_ONCE: Final = 1000
 """Samples; a hundred laps at once would take half a gigabyte."""
@@ -107,6 +110,14 @@ class LapTimes:
     cut_at: int | None
     """Index of the sample before which the car left out a piece of the track; no later lap
     counts. None if it never did."""
+    before: int = 0
+    """Laps that the plant has counted, but whose times are not in the log, as its beginning was
+    deleted."""
+
+    @property
+    def count(self) -> int:
+        """Of all laps."""
+        return self.before + len(self.times_s)
 
 
 def time_laps(track: Track, time_s: Floats, xy: Floats, s_m: Floats) -> LapTimes:
@@ -236,8 +247,8 @@ def judge(
     faults: list[str] = []
     if not len(samples):
         return Verdict(False, "failed: there is no state of the run")
-    if len(laps.times_s) < asked:
-        fault = f"{len(laps.times_s)} of {asked} laps driven"
+    if laps.count < asked:
+        fault = f"{laps.count} of {asked} laps driven"
         if laps.cut_at is not None:
             cut_s = samples["time_s"][laps.cut_at]
             fault += f": at {cut_s:.2f} s the car left out a piece of the track"
@@ -251,10 +262,19 @@ def judge(
         faults.append(f"solutions drove the car for {driven_s:.2f} of {lasted_s:.2f} s")
     if faults:
         return Verdict(False, f"failed: {'; '.join(faults)} ({cycles})")
-    times = ", ".join(f"{time:.3f}" for time in laps.times_s)
-    count = f"{len(laps.times_s)} lap{'s' if len(laps.times_s) > 1 else ''}"
-    done = f"{count} in {times} s" if times else f"{lasted_s:.2f} s driven"
-    return Verdict(True, f"passed: {done}, on the track throughout ({cycles})")
+    done = _driven(laps) or f"{lasted_s:.2f} s driven"
+    before = f"; {laps.before} laps before these are not in the log any more" if laps.before else ""
+    return Verdict(True, f"passed: {done}, on the track throughout ({cycles}){before}")
+
+
+def _driven(laps: LapTimes) -> str:
+    """The laps with their times, or with the range of many; empty without any."""
+    if not (times := laps.times_s):
+        return ""
+    listed = ", ".join(f"{time:.3f}" for time in times)
+    many = f"{min(times):.3f} to {max(times):.3f}"
+    count = f"{len(times)} lap{'s' if len(times) > 1 else ''}"
+    return f"{count} in {many if len(times) > _LISTED else listed} s"
 
 
 class DrivenLaps(NamedTuple):
@@ -268,13 +288,20 @@ class DrivenLaps(NamedTuple):
 
 def laps_in(log: Path, run: int, track: Track) -> DrivenLaps:
     """What a run in a log was; InputError if there is no log."""
-    wanted: dict[Topic[Any], str] = {STATE: STATES, TRUTH: TRUE_STATES, TELEMETRY: CYCLES}
+    wanted: dict[Topic[Any], str] = {
+        STATE: f"{STATES} lap", TRUTH: f"{TRUE_STATES} lap", TELEMETRY: CYCLES
+    }  # fmt: skip
     columns = LogColumns(log, wanted).read()
     states, truth, telemetry = (columns[one][columns[one]["run"] == run] for one in wanted)
     known = truth if len(truth) else with_estimates(states, telemetry)
     projected = track.project_path(known["x"][:, :2])
     laps = time_laps(track, known["time_s"], known["x"][:, :2], projected.s_m)
     counted = laps.after[-1] if laps.after else len(known)
+    if columns.reader.parts_gone and len(known) and known["time_s"][0] > 0:
+        # The lap that its first sample is in the middle of has a number, and no time.
+        begun = len(laps.times_s[:1])
+        laps = replace(laps, times_s=laps.times_s[1:], after=laps.after[1:],
+                       before=int(known["lap"][0]) + begun)  # fmt: skip
     return DrivenLaps(known, projected.off_track_m[:counted], laps, Cycles(telemetry))
 
 

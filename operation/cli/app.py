@@ -47,6 +47,7 @@ _TASKS: Final = {
     "processes.go processes.router processes.doctor configuration.config configuration.certs",
     "Learn while driving": "learning.learn learning.publish learning.rollback",
     "Measure": "tracks.limit race.bench race.latency race.paper",
+    "Evidence": "evidence.replay evidence.scenario evidence.shadow race.timing",
     "Many laps": "race.campaign race.campaign_report race.campaign_scheduler "
     "race.campaign_worker race.tune",
     "Export to other tools": "export.export export.fmu",

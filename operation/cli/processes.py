@@ -45,8 +45,8 @@ def _endpoint(text: str, shown: str = "as configured") -> Any:
 
 @options_of(
     "bayesrace.plant.process_settings.PlantSettings",
-    "car name rate_hz fmu fmu_map simulator delay_s sensors world seed realtime.cpu realtime.fifo "
-    "realtime.lock_memory",
+    "car name rate_hz fmu fmu_map simulator delay_s buffer_s sensors sensor_faults world seed "
+    "realtime.cpu realtime.fifo realtime.lock_memory",
 )
 def plant(
     network: "Configuration",
@@ -74,8 +74,8 @@ def plant(
 
 @options_of(
     "bayesrace.controller.process_settings.ControllerSettings",
-    "car name rate_hz budget hold compensation sensor_tolerance realtime.cpu realtime.fifo "
-    "realtime.lock_memory",
+    "car name shadow rate_hz budget hold compensation fallback.shifted_s sensor_tolerance "
+    "realtime.cpu realtime.fifo realtime.lock_memory",
 )
 def controller(
     network: "Configuration",
@@ -89,7 +89,8 @@ def controller(
         "Folder that keeps accepted weights for the next start.", metavar="DIR"
     ),
     endpoint: list[str] = _endpoint(
-        "Zenoh endpoint of the plant; repeatable.", "as configured; tcp/127.0.0.1:7447"
+        "Zenoh endpoint of the plant, for a shadow of the controller, too; repeatable.",
+        "as configured; tcp/127.0.0.1:7447",
     ),
     listen: list[str] = _endpoint(
         "Zenoh endpoint to listen on, for recorders and senders of weights; repeatable.",
@@ -108,13 +109,14 @@ def controller(
 ) -> None:
     """Drive the car of a plant process with the compiled controller, until Ctrl-C."""
     die_with_parent(parent_pid)
+    from bayesrace.controller import process, shadow
     from bayesrace.controller.assembly import predictive_controller, read_settings
-    from bayesrace.controller.process import main
     from bayesrace.controller.settings import GateSettings
 
-    endpoints = _once_valid(
-        network, "controller", listen=listen, connect=endpoint, low_latency=low_latency
-    )
+    role: Role = "shadow" if settings().shadow else "controller"
+    if role == "shadow" and (store or settings().hold):
+        raise InputError(f"a shadow drives nothing: leave out {'--store' if store else '--hold'}")
+    endpoints = _once_valid(network, role, listen=listen, connect=endpoint, low_latency=low_latency)
     thresholds = read_settings(gate, GateSettings)
     chosen = settings(endpoints=endpoints, gate=thresholds, parent_pid=parent_pid)
     if pursuit is None:
@@ -129,6 +131,7 @@ def controller(
         driver = pursuit_controller(
             artefact, chosen.car, track, raceline, pursuit, 1 / chosen.rate_hz
         )
+    main = shadow.main if role == "shadow" else process.main
     raise typer.Exit(main(chosen, driver))
 
 

@@ -1,4 +1,4 @@
-"""``race``, ``report``, ``drive``, ``bench``, ``latency``, ``paper``, ``campaign``,
+"""``race``, ``report``, ``drive``, ``bench``, ``latency``, ``timing``, ``paper``, ``campaign``,
 ``campaign-report``, ``campaign-scheduler``, ``campaign-worker``, ``tune``: whole runs, and what is
 measured with them."""
 
@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from bayesrace.operation.analysis.race import RaceAnalysis
     from bayesrace.operation.settings import RaceSettings
     from bayesrace.studies.campaign.cluster import Remote
+    from bayesrace.studies.evidence.timing.settings import TimingSettings
     from bayesrace.studies.latency.settings import LatencySettings
     from bayesrace.studies.settings import BenchSettings, PaperSettings, TuneSettings
     from bayesrace.transport import Endpoints
@@ -31,6 +32,7 @@ __all__ = [
     "paper",
     "race",
     "report",
+    "timing",
     "tune",
 ]
 
@@ -119,6 +121,12 @@ def drive(
     laps: int = options.value("Laps to drive, the first from rest.", 2, min=1),
     max_time: float = options.value("Time limit [s].", 60.0, min=1, max=1e6, metavar="S"),
     log: Path = options.new_file("Log to write (MCAP).", default=Path("run.mcap")),
+    max_log: str | None = options.value(
+        "Size of the log at most, as 500MB or 2GB: it goes on in new files, run.1.mcap and so on, "
+        "and the oldest are deleted.",
+        metavar="SIZE",
+        shown="no limit",
+    ),
     name: str = options.CAR_NAME,
     hold_to_run: bool = options.flag(
         "--hold-to-run",
@@ -130,6 +138,7 @@ def drive(
     Exit code 0 if all laps were driven on the track, by the controller's solutions; 1 if not; 2 if
     the run could not be driven to its end.
     """
+    from bayesrace.log_parts import log_size
     from bayesrace.operation.drive import drive_and_judge
     from bayesrace.operation.run_plan import RunPlan
     from bayesrace.tracks import load_track
@@ -138,7 +147,9 @@ def drive(
     course = load_track(chosen.track, chosen.car.width_m)
     held = hold_to_run or configuration.drive.hold_to_run
     plan = RunPlan(0, "manual", laps, max_time, chosen.mode == "lockstep", held=held)
-    end, verdict = drive_and_judge(director, chosen.car, name or chosen.car.name, course, plan, log)
+    limit = configuration.drive.max_log if max_log is None else log_size(max_log)
+    name = name or chosen.car.name
+    end, verdict = drive_and_judge(director, chosen.car, name, course, plan, log, limit)
     typer.echo(f"{end.text}; log: {log}\n{verdict.text}")
     if not verdict.passed:
         raise typer.Exit(1)
@@ -207,6 +218,41 @@ def latency(
         raise run.error
 
 
+@options_of(
+    "bayesrace.studies.evidence.timing.settings.TimingSettings",
+    "tracks problems cases rate_hz budget at_most_ms exceedance horizon sensors weights artefact "
+    "points seed car",
+    file=True,
+)
+def timing(
+    settings: "Given[TimingSettings]",
+    logs: list[Path] = options.argument(
+        "LOG", "Run logs (MCAP) whose states are solved again; without, tracks are driven.", ()
+    ),
+    out: Path | None = options.out_folder("Folder for results.", "runs/timing-DATE-TIME"),
+    junit: Path | None = options.new_file("Write the verdict as JUnit XML.", "--junit"),
+) -> None:
+    """Show whether the controller answers in time: phases on recorded and on adversarial problems.
+
+    Searches for the hardest starts, compares the work with its bounds by construction, and
+    extrapolates. Leaves timing.json, a picture and all times. Exit code 0 if all checks hold, 1 if
+    not; see docs/timing.md.
+    """
+    from bayesrace.operation.terminal.terminal import Terminal
+    from bayesrace.studies.evidence.timing.report import print_study, write_study
+    from bayesrace.studies.evidence.timing.study import run_timing
+
+    folder = options.run_folder(out, "timing-")
+    with options.stages_shown() as stages:
+        study = run_timing(settings(), logs, stages)
+    write_study(study, folder)
+    print_study(study, Terminal())
+    if junit is not None:
+        study.verdict.write_junit(junit)
+    typer.echo(f"{folder}")
+    raise typer.Exit(study.verdict.exit_code)
+
+
 @options_of("bayesrace.studies.settings.PaperSettings", "tracks data raceline quick seed")
 def paper(
     settings: "Given[PaperSettings]",
@@ -234,12 +280,25 @@ def campaign(
     key: Path | None = _KEY,
     workers: int = _WORKERS,
     again: bool = options.flag("--again", "Compute cases that failed once more."),
+    scenario: str | None = options.value(
+        "Scenario that the plan's [grid] varies, as event.0.delay_ms: docs/scenarios.md.",
+        metavar="FILE",
+    ),
 ) -> None:
     """Drive all cases of a plan, on this machine or on many; one row a lap in Parquet.
 
     What is there already is not computed again: the same command goes on after an interruption.
     Leaves laps.parquet and report.html.
     """
+    if scenario is not None:
+        from bayesrace.operation.cli.evidence import drive_and_judge
+        from bayesrace.studies.evidence.scenario.run import read_grid
+
+        if scheduler is not None or again:
+            raise InputError("--scenario is driven anew, here: leave out --scheduler and --again")
+        folder = out or Path("runs") / plan.stem
+        drive_and_judge(read_grid(plan, scenario), folder, None, workers)
+        return
     from bayesrace.operation.terminal.terminal import Terminal
     from bayesrace.studies.campaign.campaign import run_campaign
     from bayesrace.studies.campaign.plan import read_plan

@@ -23,9 +23,10 @@ import numpy as np
 import zenoh
 from numpy.typing import NDArray
 
+from bayesrace.clock import sleep_until_ns
 from bayesrace.operation.system import child
 from bayesrace.processes import die_with_parent
-from bayesrace.realtime import RealtimeSettings, prepare_thread, sleep_until_ns
+from bayesrace.realtime import RealtimeSettings, prepare_thread
 from bayesrace.studies.latency.analysis import BareLoop, Series
 from bayesrace.transport import Endpoints, open_session, private_endpoints
 

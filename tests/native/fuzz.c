@@ -101,6 +101,7 @@ static const br_mpc_parameters usual = {
     .caution_sigmas = 1.6,
     .iterations = 3,
     .iterations_cold = 12,
+    .qp_steps = 2000,
 };
 
 static br_mpc_parameters parameters;
@@ -122,6 +123,7 @@ static void set_parameters(controller *c, int count) {
     for (size_t i = 0; i < offsetof(br_mpc_parameters, iterations) / sizeof(double); ++i)
         field[i] = number(field[i], 0.9 * fabs(field[i]));
     p.iterations = byte() % 8, p.iterations_cold = byte() % 32;
+    p.qp_steps = 190 + byte();
     br_mpc_error error = BR_OK;
     for (int i = 0; i < count; ++i) error = br_mpc_set_parameters(c[i].mpc, &p);
     CHECK(error == BR_OK || error == BR_ERROR_PARAMETERS);
@@ -183,6 +185,7 @@ static void check_answer(const double u[BR_NU], br_mpc_status status, const br_m
     const int limit = p->iterations > p->iterations_cold ? p->iterations : p->iterations_cold;
     CHECK(status >= BR_CONVERGED && status <= BR_TIME_LIMIT);
     CHECK(info->iterations <= limit + (BR_COLD_GUESSES + 1) * BR_SECOND_START_ITERATIONS);
+    CHECK(info->qp_iterations <= p->qp_steps);
     CHECK(info->pace > 0 && info->pace <= 1);
     CHECK(info->widening >= 1 && info->widening <= 1e6);
     if (status > BR_ACCEPTABLE) {

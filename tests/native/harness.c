@@ -76,9 +76,10 @@ static double *read_file(const char *path) {
 
 static br_mpc_parameters read_parameters(void) {
     br_mpc_parameters p;
-    const size_t size = offsetof(br_mpc_parameters, iterations); /* doubles, then two ints */
+    const size_t size = offsetof(br_mpc_parameters, iterations); /* doubles, then ints */
     memcpy(&p, take(size / sizeof(double)), size);
     p.iterations = (int)next(), p.iterations_cold = (int)next();
+    p.qp_steps = (int)next();
     return p;
 }
 

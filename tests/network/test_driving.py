@@ -27,9 +27,9 @@ from bayesrace.files import temporary_folder
 from bayesrace.log import LogReader
 from bayesrace.messages import STATE
 from bayesrace.transport import free_endpoint
+from bayesrace.transport.relay import Relay
 from tests.network.cars import Course, Program, gentle_course, start_controller, start_plant
 from tests.network.observer import STANDING_MPS, Journey, Observer, drive_on, observing
-from tests.network.proxy import Proxy
 from tests.programs import PATIENCE_S, ROOT, run, until
 
 pytestmark = [pytest.mark.wall_clock, pytest.mark.unmeasured]
@@ -41,7 +41,7 @@ BAD: Final = {"delay_s": 0.02, "jitter_s": 0.005, "loss": 0.05}
 class Rig:
     """A car on its way over a link."""
 
-    link: Proxy
+    link: Relay
     course: Course
     plant: Program
     controller: Program
@@ -89,7 +89,7 @@ def driving(
     plant_at, controller_at = (free_endpoint().replace("tcp", protocol) for _ in range(2))
     log = folder / "run.mcap"
     with ExitStack() as cleanup:
-        link = cleanup.enter_context(Proxy(plant_at))
+        link = cleanup.enter_context(Relay(plant_at))
         link.set(**conditions)
         plant = cleanup.enter_context(start_plant(folder, plant_at))
         driver = start_controller(folder, course, link.endpoint, controller_at)
@@ -150,7 +150,7 @@ def test_a_drive_from_the_command_line_outlasts_a_short_partition(
     where = ("--track", course.track_file, "--endpoint", plant_at, "--endpoint", controller_at)
     options = ("--mode", "realtime", "--laps", "2", "--max-time", "200", "--log", log)
     with (
-        Proxy(plant_at) as link,
+        Relay(plant_at) as link,
         start_plant(tmp_path, plant_at) as plant,
         start_controller(tmp_path, course, link.endpoint, controller_at) as controller,
         Program(tmp_path / "drive.txt", "drive", *where, *options) as drive,

@@ -19,9 +19,9 @@ import pytest
 
 from bayesrace.configuration import read_configuration
 from bayesrace.transport import free_endpoint
+from bayesrace.transport.relay import Relay
 from tests.network.cars import Course, gentle_course, start_controller, start_plant
 from tests.network.observer import observing
-from tests.network.proxy import Proxy
 from tests.programs import ROOT, environment, until
 from tests.security.authority import Bundles, bundles
 from tests.security.rig import secured
@@ -93,7 +93,7 @@ def test_observers_that_are_stopped(tmp_path: Path, course: Course, count: int) 
 def test_observers_that_read_slowly_or_vanish(tmp_path: Path, course: Course, vanish: bool) -> None:
     with driving(tmp_path, course) as (where, braked):
         rate = math.inf if vanish else 1e4
-        plant, controller = (Proxy(one, bytes_per_s=rate) for one in where)
+        plant, controller = (Relay(one, bytes_per_s=rate) for one in where)
 
         def trouble() -> None:
             if vanish:

@@ -49,6 +49,7 @@ def make_bundles(folder: Path) -> None:
     roles: tuple[Role, ...] = ("learning", "director", "viewer", "router")
     for role in roles:
         add(folder, role, role)
+    add(folder, "shadow", "shadow", CAR)
     add(folder, "one-viewer", "viewer", CAR)
     bad = folder / "bad"
     bad.mkdir()

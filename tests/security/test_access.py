@@ -19,7 +19,9 @@ from tests.security.intruder import ALIVE_KEYS, FORGED, KEYS, SERVICE_KEYS, TOPI
 
 __all__ = ["bundles"]
 
-ALL_TOPICS: Final = "state truth actuation braking telemetry event/* status/*"
+ALL_TOPICS: Final = (
+    "state truth actuation braking telemetry event/* status/* shadow/*/actuation shadow/*/telemetry"
+)
 
 
 class Rights(NamedTuple):
@@ -42,6 +44,7 @@ RIGHTS: Final[dict[str, Rights]] = {
         "controller/status controller/weights controller/rollback controller/command",
         "alive/controller/*",
     ),
+    "shadow": Rights("shadow/*/actuation shadow/*/telemetry", "state actuation"),
     "learning": Rights(
         "", "state actuation braking telemetry event/* status/*",
         "*/status controller/weights controller/rollback",
@@ -128,6 +131,7 @@ MEMBERS: Final = (
     ("plant", "plant", (CAR,)),
     ("controller", "controller", (CAR,)),
     (f"{OTHER}-controller", "controller", (OTHER,)),
+    ("shadow", "shadow", (CAR,)),
     ("learning", "learning", EVERY),
     ("director", "director", EVERY),
     ("viewer", "viewer", EVERY),

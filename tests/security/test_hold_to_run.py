@@ -20,9 +20,9 @@ from bayesrace.messages import EVENT, State
 from bayesrace.operation.run_plan import RunPlan, run_request
 from bayesrace.recorder import Recorder
 from bayesrace.transport import Director, free_endpoint, open_session
+from bayesrace.transport.relay import Relay
 from tests.network.cars import Course, Program
 from tests.network.observer import STANDING_MPS, Journey
-from tests.network.proxy import Proxy
 from tests.programs import run, until
 from tests.security.authority import CAR, Bundles, bundles, written
 from tests.security.rig import attacking, course, secured
@@ -47,8 +47,8 @@ class Rig:
     plant: Program
     controller: Program
     drive: Program
-    plant_link: Proxy
-    controller_link: Proxy
+    plant_link: Relay
+    controller_link: Relay
     director: Director
     """Another one, which looks on."""
     course: Course
@@ -103,7 +103,7 @@ def held(folder: Path, course: Course, bundles: Bundles, *options: str) -> Itera
         driver = ("controller", *course.arguments, *with_config)
         controller = stack.enter_context(Program(folder / "controller.txt", *driver))
         to_plant, to_controller = (
-            stack.enter_context(Proxy(one)) for one in (plant_at, controller_at)
+            stack.enter_context(Relay(one)) for one in (plant_at, controller_at)
         )
         by_links = folder / "links.toml"
         by_links.write_text(

@@ -72,7 +72,7 @@ static br_mpc_error use_parameters(controller *c, const double *v) {
     return error ? error : br_cycle_set_driving(c->cycle, &driving);
 }
 
-#define UNUSABLE "controller: %s (q_position to iterations_cold; d_min must be below d_max)"
+#define UNUSABLE "controller: %s (q_position to qp_steps; d_min must be below d_max)"
 
 /* Uses what has been set since the step before. Each parameter is within its bounds; those that do
  * not fit together are given up: step and FMU go on with the parameters of the step before. */

@@ -11,7 +11,7 @@
 #define HEAD_BYTES 32
 #define SCHEMA 2
 #define LINE_BYTES 512
-#define WHOLE_MAX 1000
+#define WHOLE_MAX 1000000
 #define GP_HEAD_BYTES (2 * 4 + (4 + BR_NZ) * 8)
 #define PATH_BYTES_MAX (8 + (size_t)BR_PATH_CAPACITY * BR_PATH_COLUMNS * 8)
 #define WEIGHTS_BYTES_MAX \
@@ -198,7 +198,7 @@ static int take_line(const reader *r, char *line, setting *settings, int count) 
     settings[i].found = 1;
     if (!settings[i].whole) return 0;
     if (!(value >= 0 && value <= WHOLE_MAX && value == floor(value)))
-        return wrong(r, "has no whole number from 0 to 1000", name);
+        return wrong(r, "has no whole number from 0 to 1000000", name);
     *settings[i].whole = (int)value;
     return 0;
 }

@@ -1,7 +1,8 @@
 """A bad link: a relay between an endpoint of its own and another one, by TCP or UDP.
 
 It delays and loses what passes, holds it up as a partition does, or breaks its connections. What is
-lost by TCP arrives late, and holds up what comes after it; by UDP it does not arrive.
+lost by TCP arrives late, and holds up what comes after it; by UDP it does not arrive, and datagrams
+overtake each other. It needs nothing of the system, where not every kernel emulates networks.
 """
 
 import math
@@ -15,9 +16,9 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Final
 
-from bayesrace.transport import free_endpoint
+from bayesrace.transport.endpoints import address_of, free_endpoint
 
-__all__ = ["Proxy"]
+__all__ = ["Relay"]
 
 _AGAIN: Final = 4
 """After so many times the delay, two round trips, TCP sends again what was lost."""
@@ -25,8 +26,8 @@ _DATAGRAM: Final = 1 << 16
 
 
 def _address(endpoint: str) -> tuple[str, int]:
-    host, port = endpoint.partition("/")[2].rsplit(":", 1)
-    return host, int(port)
+    address = address_of(endpoint)
+    return address.host, address.port
 
 
 def _opened() -> threading.Event:
@@ -41,10 +42,19 @@ class _Way:
 
     random: random.Random
     open: threading.Event = field(default_factory=_opened)
+    delay_s: float = 0.0
+    jitter_s: float = 0.0
+    loss: float = 0.0
     lost: int = 0
 
+    def draw(self) -> tuple[bool, float]:
+        """Of what passes next: whether it is lost, and how long it takes [s]."""
+        lost = self.random.random() < self.loss
+        self.lost += lost
+        return lost, self.delay_s + self.random.uniform(-self.jitter_s, self.jitter_s)
 
-class Proxy:
+
+class Relay:
     """Relays to the endpoint ``target`` whatever connects to :attr:`endpoint`.
 
     Directions: ``forth`` is from the target, ``back`` to it.
@@ -59,23 +69,34 @@ class Proxy:
         self._lock = threading.Lock()
         self._sockets: list[socket.socket] = []
         self._listener: socket.socket | None = None
-        self._ways = {name: _Way(random.Random(name)) for name in ("forth", "back")}
-        self.set()
+        self._ways = {
+            name: _Way(random.Random(name))  # noqa: S311 (no secret)
+            for name in ("forth", "back")
+        }
         self.join()
 
     def set(self, delay_s: float = 0.0, jitter_s: float = 0.0, loss: float = 0.0) -> None:
         """Time on the way, uniform in ``delay_s`` ± ``jitter_s``, and probability of a loss."""
-        self._delay_s, self._jitter_s, self._loss = delay_s, jitter_s, loss
+        for direction in self._ways:
+            self.set_way(direction, delay_s, jitter_s, loss)
+
+    def set_way(self, direction: str, delay_s: float, jitter_s: float, loss: float) -> None:
+        """The same of one direction."""
+        way = self._ways[direction]
+        way.delay_s, way.jitter_s, way.loss = delay_s, jitter_s, loss
 
     def hold(self, direction: str = "") -> None:
         """Nothing gets through any more; both directions without one."""
-        for name in [direction] if direction else self._ways:
-            self._ways[name].open.clear()
+        for way in self._chosen(direction):
+            way.open.clear()
 
-    def release(self) -> None:
+    def release(self, direction: str = "") -> None:
         """The end of that."""
-        for way in self._ways.values():
+        for way in self._chosen(direction):
             way.open.set()
+
+    def _chosen(self, direction: str) -> list[_Way]:
+        return [self._ways[direction]] if direction else list(self._ways.values())
 
     @property
     def lost(self) -> dict[str, int]:
@@ -105,7 +126,7 @@ class Proxy:
             with suppress(OSError):
                 one.shutdown(socket.SHUT_RDWR)
 
-    def __enter__(self) -> "Proxy":
+    def __enter__(self) -> "Relay":
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -161,8 +182,29 @@ class Proxy:
         def to_client(data: bytes) -> None:
             near.sendto(data, *client)
 
-        self._start("back", from_client, to_target, near.close)
-        self._start("forth", lambda: far.recv(_DATAGRAM), to_client, far.close)
+        self._pass_on("back", from_client, to_target)
+        self._pass_on("forth", lambda: far.recv(_DATAGRAM), to_client)
+
+    def _pass_on(
+        self, direction: str, receive: Callable[[], bytes], send: Callable[[bytes], object]
+    ) -> None:
+        """Each datagram takes its own time."""
+        way = self._ways[direction]
+
+        def deliver(data: bytes) -> None:
+            with suppress(OSError):  # the relay is gone
+                send(data)
+
+        def take() -> None:
+            with suppress(OSError):
+                while data := receive():
+                    lost, delay_s = way.draw()
+                    if not lost and way.open.is_set():
+                        later = threading.Timer(max(delay_s, 0.0), deliver, (data,))
+                        later.daemon = True
+                        later.start()
+
+        threading.Thread(target=take, daemon=True).start()
 
     def _start(
         self,
@@ -171,23 +213,16 @@ class Proxy:
         send: Callable[[bytes], object],
         end: Callable[[], None],
     ) -> None:
-        """Relays until there is nothing to receive any more."""
+        """Relays a stream in its order, until there is nothing to receive any more."""
         way, waiting = self._ways[direction], queue.Queue[tuple[float, bytes]](10_000)
-        datagrams = self._protocol == "udp"
 
         def take() -> None:
             due_s = 0.0
             with suppress(OSError):
                 while data := receive():
-                    lost = way.random.random() < self._loss
-                    way.lost += lost
-                    if datagrams and (lost or not way.open.is_set()):
-                        continue
-                    delay_s = self._delay_s + way.random.uniform(-self._jitter_s, self._jitter_s)
-                    due_s = max(
-                        due_s,
-                        time.monotonic() + delay_s + (_AGAIN * self._delay_s if lost else 0.0),
-                    )
+                    lost, delay_s = way.draw()
+                    delay_s += _AGAIN * way.delay_s if lost else 0.0
+                    due_s = max(due_s, time.monotonic() + delay_s)
                     waiting.put((due_s, data))
             waiting.put((0.0, b""))
 

@@ -1,0 +1,234 @@
+"""What the controller has to solve, recorded and adversarial, and how long each phase takes.
+
+Every cycle is made as the controller's process makes it: the state is taken (estimate), answered
+(feedback), and the next one prepared. A second controller gets the same states too late for a step:
+its answer is the fallback's. Times are the thread's processor time, so that neither other processes
+nor waiting count.
+"""
+
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+from msgspec import structs
+
+from bayesrace.arrays import Floats
+from bayesrace.controller.assembly import PredictiveController, compiled_controller
+from bayesrace.controller.cycle import Cycle
+from bayesrace.controller.process_settings import ControllerSettings
+from bayesrace.gp.weights import Weights, read_weights
+from bayesrace.messages import State
+from bayesrace.operation.closed_loop import built_in_car
+from bayesrace.operation.preparation import Prepared
+from bayesrace.operation.run_plan import RunPlan, run_request
+from bayesrace.operation.training_drives import PreparedTrack
+from bayesrace.plant.car import CarRun, drive_lockstep
+from bayesrace.plant.simulator import PLANT
+from bayesrace.realtime import uncollected
+from bayesrace.studies.evidence.timing.counter import InstructionCounter
+from bayesrace.studies.evidence.timing.settings import TimingSettings
+
+__all__ = ["COLUMNS", "KINDS", "Case", "Rig", "search", "work"]
+
+COLUMNS: Final = (
+    "estimate", "feedback", "prepare", "fallback", "iterations", "qp_steps", "instructions"
+)  # fmt: skip
+"""Of a cycle: times [ms], then counts of the feedback."""
+
+_CYCLES: Final = 10
+"""Of an adversarial case, from its start on."""
+
+_Range = tuple[Sequence[float], Sequence[float]]
+KINDS: Final[dict[str, _Range]] = {
+    "launch": ((0, -0.5, -3.14, 0, 0, 0, -0.5), (1, 0.5, 3.14, 0.1, 0, 0, 0.5)),
+    "hairpin": ((-0.05, -1, -0.6, 0.4, -0.1, -0.1, -1), (0.05, 1, 0.6, 1.2, 0.1, 0.1, 1)),
+    "spin": ((0, -1, -3.14, 0.1, -0.6, -0.3, -1), (1, 1, 3.14, 1, 0.6, 0.3, 1)),
+    "off track": ((0, -4, -3.14, 0, -0.3, -0.1, -1), (1, 4, 3.14, 1, 0.3, 0.1, 1)),
+    "weights": ((0, -1, -1, 0, -0.3, -0.1, -1), (1, 1, 1, 1, 0.3, 0.1, 1)),
+}
+"""Least and largest start: along the track, from its tightest bend for a hairpin, as a share of its
+length; beside it, in half widths; heading off the track's; vx, vy as shares of the line's top
+speed; yaw rate as one of top speed over wheelbase; steering angle of the largest."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """A start from which the controller drives for some cycles."""
+
+    kind: str
+    track: int
+    start: tuple[float, ...]
+    """As in :data:`KINDS`."""
+
+    @classmethod
+    def drawn(cls, kind: str, tracks: int, random: np.random.Generator) -> "Case":
+        """Anywhere in its range."""
+        start = random.uniform(*KINDS[kind])
+        return cls(kind, int(random.integers(tracks)), tuple(start.tolist()))
+
+    def changed(self, random: np.random.Generator) -> "Case":
+        """Nearby, within its range."""
+        low, high = np.array(KINDS[self.kind])
+        start = np.array(self.start) + 0.1 * (high - low) * random.standard_normal(len(low))
+        return replace(self, start=tuple(np.clip(start, low, high).tolist()))
+
+
+class Rig:
+    """Controllers of each track, with weights as given and with rough ones at full capacity."""
+
+    def __init__(
+        self, settings: TimingSettings, prepared: Prepared, counter: InstructionCounter
+    ) -> None:
+        self._settings, self._prepared, self._counter = settings, prepared, counter
+        self._car, self._vehicle = settings.driven_car, built_in_car(settings.driven_car)
+        self._weights, self._run = read_weights(prepared.weights), 0
+        self._made: dict[tuple[int, bool], tuple[Cycle, Cycle, PredictiveController]] = {}
+        self.tracks: tuple[PreparedTrack, ...] = prepared.tracks
+        self.most_qp_steps, self.most_iterations = self._bounds()
+        *_, controller = self._controllers(0, rough=False)
+        self.horizon = controller.native.manifest.horizon
+
+    def _bounds(self) -> tuple[int, int]:
+        """Of a feedback by construction: steps of its QPs, and SQP iterations (br_step.c)."""
+        *_, controller = self._controllers(0, rough=False)
+        library, mpc = controller.artefact.library, controller.native._parameters
+        starts = (library.BR_COLD_GUESSES + 1) * library.BR_SECOND_START_ITERATIONS
+        return mpc.qp_steps, max(mpc.iterations, mpc.iterations_cold) + starts
+
+    def _controllers(self, track: int, rough: bool) -> tuple[Cycle, Cycle, PredictiveController]:
+        if (found := self._made.get((track, rough))) is None:
+            one, artefact = self.tracks[track], self._prepared.artefacts[0]
+            weights = self._weights
+            makes = [
+                compiled_controller(artefact, self._car, one.track, one.line, weights)
+                for _ in range(2)
+            ]
+            if rough:
+                capacity = makes[0].native.manifest.gp_capacity
+                for each in makes:
+                    each.native.set_weights(_roughened(weights, capacity, self._settings.seed))
+            settings = ControllerSettings(car=self._car)
+            cycle, blind = (Cycle(each, self._car, settings) for each in makes)
+            found = self._made[track, rough] = cycle, blind, makes[0]
+        return found
+
+    def _answered(self, state: State, track: int, rough: bool, budget: float) -> list[float]:
+        """Of a cycle by this state: what :data:`COLUMNS` says."""
+        cycle, blind, controller = self._controllers(track, rough)
+        period_s, now, read = self._settings.period_s, time.thread_time_ns, self._counter.read
+        times = [now()]
+        cycle.driver.observe(state)
+        times.append(now())
+        count = read()
+        decision = cycle.decide(state.time_s, budget * period_s)
+        count = read() - count
+        times.append(now())
+        info = controller.artefact.library.br_cycle_info(cycle.driver._cycle)
+        counts = (info.iterations, info.qp_iterations) if decision.stepped else (0, 0)
+        begin = now()
+        cycle.prepare(PLANT.step_s, budget * period_s)
+        prepared = now() - begin
+        blind.driver.observe(state)
+        late_s = 2 * max(ControllerSettings(car=self._car).stale_s, PLANT.step_s)
+        begin = now()
+        blind.decide(state.time_s + late_s)
+        spent = [*np.diff(times), prepared, now() - begin]
+        return [*(1e-6 * float(ns) for ns in spent), *counts, count]
+
+    def _begin(self, track: int, rough: bool) -> Cycle:
+        """Another run: its first state counts. The cycle that will answer."""
+        self._run += 1
+        cycle, blind, _ = self._controllers(track, rough)
+        for one in (cycle, blind):
+            one.driver.lost(silent=False)
+        return cycle
+
+    def replay(self, states: Sequence[State], track: int = 0) -> Floats:
+        """Cycles (n, 7) by the states of one run, whatever the answers are."""
+        self._begin(track, rough=False)
+        again = (structs.replace(one, run=self._run) for one in states if not one.final)
+        with uncollected():
+            budget = self._settings.budget
+            return np.array([self._answered(one, track, False, budget) for one in again])
+
+    def drive(self, track: int, cycles: int) -> Floats:
+        """Cycles (n, 7) of a drive from the start line."""
+        return self._driven(track, cycles, None, False, self._settings.budget)
+
+    def run(self, case: Case, budget: float | None = None) -> Floats:
+        """Cycles (n, 7) from the case's start; with the budget of the settings, or this one."""
+        given = self._settings.budget if budget is None else budget
+        return self._driven(case.track, _CYCLES, self._start(case), case.kind == "weights", given)
+
+    def _driven(
+        self, track: int, cycles: int, x0: Sequence[float] | None, rough: bool, budget: float
+    ) -> Floats:
+        cycle, rows = self._begin(track, rough), list[list[float]]()
+
+        def exchange(state: State, _: tuple[float, ...]) -> tuple[float, float]:
+            if not state.final:
+                rows.append(self._answered(state, track, rough, budget))
+            return cycle.driver.decision.d, cycle.driver.decision.delta_rate
+
+        plan = RunPlan(self._run, "", 0, cycles * PLANT.step_s, lockstep=True)
+        request = run_request(self.tracks[track].track, plan)
+        if x0 is not None:
+            request = structs.replace(request, x0=tuple(x0))
+        run = CarRun(request, self._vehicle, 1, self._settings.instruments)
+        with uncollected():
+            drive_lockstep(run, 0, exchange)
+        return np.array(rows)
+
+    def _start(self, case: Case) -> list[float]:
+        """The state (7,)."""
+        along, beside, heading, vx, vy, yaw, steered = case.start
+        one, car = self.tracks[case.track], self._car
+        track, fastest = one.track, float(one.line.vx_mps.max())
+        s = along * track.length_m
+        if case.kind == "hairpin":
+            nodes = np.linspace(0, track.length_m, 400, endpoint=False)
+            s += float(nodes[np.argmax(np.abs(track.curvature(nodes)))])
+        right, left = track.widths(s)
+        x, y = track.position(s) + 0.5 * beside * (right + left) * track.normal(s)
+        numbers = (
+            x, y, float(track.heading(s)) + heading, vx * fastest, vy * fastest,
+            yaw * fastest / car.wheelbase_m, steered * car.delta_max_rad,
+        )  # fmt: skip
+        return [float(one) for one in numbers]
+
+
+def _roughened(weights: Weights, capacity: int, seed: int) -> Weights:
+    """With as many points as fit, strewn about those learned, and shorter length scales."""
+    random, outputs = np.random.default_rng(seed), []
+    for one in weights.outputs:
+        scales = one.length_scales * random.uniform(0.3, 1.0, one.length_scales.size)
+        chosen = random.integers(max(one.count, 1), size=capacity)
+        about = one.inputs[chosen] if one.count else np.zeros((capacity, scales.size))
+        inputs = about + scales * random.standard_normal(about.shape)
+        alpha = random.standard_normal(capacity) / np.sqrt(capacity)
+        outputs.append(replace(one, length_scales=scales, inputs=inputs, alpha=alpha))
+    first, second, third = outputs
+    return replace(weights, version="rough", outputs=(first, second, third))
+
+
+def work(rows: Floats, counted: bool) -> float:
+    """Of the hardest cycle: instructions where they are ``counted``, else iterations times QP
+    steps. The same each time, as times are not."""
+    return float(rows[:, 6].max() if counted else (rows[:, 4] * rows[:, 5]).max())
+
+
+def search(rig: Rig, cases: int, seed: int, counted: bool) -> Iterator[tuple[Case, Floats]]:
+    """So many cases drawn at random, all kinds in turn, then as many that climb from the worst,
+    each with its cycles, which have no budget: their work depends on nothing else."""
+    random, names = np.random.default_rng(seed), tuple(KINDS)
+    worst: list[tuple[float, Case]] = []
+    for number in range(2 * cases):
+        if number < cases:
+            case = Case.drawn(names[number % len(names)], len(rig.tracks), random)
+        else:
+            case = worst[int(random.integers(len(worst)))][1].changed(random)
+        rows = rig.run(case, budget=0.0)
+        worst = sorted([*worst, (work(rows, counted), case)], key=lambda one: -one[0])[:5]
+        yield case, rows

@@ -1,0 +1,205 @@
+"""Times what was recorded and what is hard, and judges it."""
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from pydantic import BaseModel
+
+from bayesrace.arrays import Floats
+from bayesrace.errors import InputError
+from bayesrace.log import LogReader
+from bayesrace.messages import STATE, State
+from bayesrace.operation.preparation import prepare
+from bayesrace.operation.terminal.terminal import Stages
+from bayesrace.studies.evidence.timing.counter import InstructionCounter
+from bayesrace.studies.evidence.timing.problems import COLUMNS, Case, Rig, search, work
+from bayesrace.studies.evidence.timing.settings import TimingSettings
+from bayesrace.studies.evidence.timing.tail import Tail, fit_tail
+from bayesrace.studies.evidence.verdict import Check, Verdict
+
+__all__ = ["PHASES", "Study", "TimingResult", "run_timing"]
+
+PHASES: Final = ("estimate", "feedback", "answer", "prepare", "fallback")
+"""Of a cycle; the answer is estimate and feedback, what a state waits for."""
+
+_BLOCK: Final = 5
+"""Cycles of which the longest counts as one value of the tail: neighbours are alike."""
+
+
+class Times(BaseModel):
+    """Of a phase [ms]."""
+
+    name: str
+    """The problems, and the phase."""
+    p50: float
+    p99: float
+    p999: float
+    max: float
+    tail: Tail | None
+    """Of the answer and the fallback to recorded problems; None: not fitted, or too few."""
+
+
+class Hardest(BaseModel):
+    """The most that a feedback without budget has taken, and can take."""
+
+    name: str
+    most: int
+    bound: int
+    """By construction; 0: none."""
+
+
+class TimingResult(BaseModel):
+    """``timing.json``."""
+
+    car: str
+    tracks: tuple[str, ...]
+    rate_hz: float
+    limit_ms: float
+    horizon: int
+    cycles: dict[str, int]
+    times: tuple[Times, ...]
+    hardest: tuple[Hardest, ...]
+    worst: tuple[str, ...]
+    """The starts that take the most, hardest first."""
+    counter: str
+    """Why instructions are not counted; empty: they are."""
+    statement: str
+
+
+@dataclass(frozen=True, eq=False)
+class Study:
+    """All that was measured."""
+
+    result: TimingResult
+    verdict: Verdict
+    values: dict[str, Floats]
+    """Times [ms] by problems and phase."""
+
+
+def run_timing(settings: TimingSettings, logs: Sequence[Path], stages: Stages) -> Study:
+    """Prepares, measures and judges. InputError for logs or files that cannot be used."""
+    runs = list(_runs(logs))
+    prepared = prepare(
+        settings, settings.driven_on, stages, weights=settings.weights, artefact=settings.artefact
+    )
+    counter = InstructionCounter()
+    try:
+        rig, counted = Rig(settings, prepared, counter), not counter.missing
+        with stages.stage("recorded problems"):
+            recorded = list(_recorded(rig, runs, settings.problems))
+        with stages.stage("search for the worst") as stage:
+            found: list[tuple[Case, Floats]] = []
+            for one in search(rig, settings.cases, settings.seed, counted):
+                found.append(one)
+                stage.update(len(found) / (2 * settings.cases))
+        with stages.stage("adversarial problems"):
+            adversarial = [rig.run(case) for case, _ in found]
+    finally:
+        counter.close()
+    found.sort(key=lambda one: -work(one[1], counted))
+    everything = np.vstack([*recorded, *adversarial, *(rows for _, rows in found)])
+    return _judged(settings, rig, counter.missing, recorded, np.vstack(adversarial), found,
+                   everything)  # fmt: skip
+
+
+def _runs(logs: Sequence[Path]) -> Iterator[list[State]]:
+    """States of each run in the logs that has some."""
+    for path in logs:
+        states = LogReader(path).select(STATE)
+        if not states:
+            raise InputError(f"{path}: no states in it; give the log of a drive")
+        for run in sorted(Counter((one.epoch, one.run) for one in states)):
+            yield [one for one in states if (one.epoch, one.run) == run]
+
+
+def _recorded(rig: Rig, runs: Sequence[list[State]], problems: int) -> Iterator[Floats]:
+    """Cycles of the logs, or else of drives. Logs are of the first track."""
+    track = rig.tracks[0].track
+    for states in runs:
+        known = np.array([one.x[:2] for one in states if not one.estimated]).reshape(-1, 2)
+        if len(known) and np.median(track.project_points(known).off_track_m) > 0:
+            raise InputError(f"the log's car was not on {track.name}: name its --track")
+        yield rig.replay(states)
+    if not runs:
+        for number in range(len(rig.tracks)):
+            yield rig.drive(number, problems // len(rig.tracks))
+
+
+def _phases(rows: Floats) -> dict[str, Floats]:
+    columns = dict(zip(COLUMNS, rows.T, strict=True))
+    return {**columns, "answer": columns["estimate"] + columns["feedback"]}
+
+
+def _blocks(drives: Sequence[Floats], phase: str) -> Floats:
+    """The longest time of each block of a drive but the first, which holds the launch."""
+    found = [_phases(rows)[phase] for rows in drives]
+    whole = (one[_BLOCK : len(one) // _BLOCK * _BLOCK].reshape(-1, _BLOCK) for one in found)
+    return np.concatenate([one.max(axis=1) for one in whole if one.size] or [np.zeros(0)])
+
+
+def _judged(
+    settings: TimingSettings, rig: Rig, missing: str, recorded: list[Floats], adversarial: Floats,
+    found: list[tuple[Case, Floats]], everything: Floats,
+) -> Study:  # fmt: skip
+    values, times, checks = dict[str, Floats](), list[Times](), list[Check]()
+    limit = settings.limit_ms
+    for name, rows in (("recorded", np.vstack(recorded)), ("adversarial", adversarial)):
+        for phase in PHASES:
+            ms = values[f"{name} {phase}"] = _phases(rows)[phase]
+            p50, p99, p999, most = np.percentile(ms, [50, 99, 99.9, 100]).tolist()
+            fitted = name == "recorded" and phase in ("answer", "fallback")
+            tail = fit_tail(_blocks(recorded, phase), settings.exceedance) if fitted else None
+            times.append(
+                Times(name=f"{name} {phase}", p50=p50, p99=p99, p999=p999, max=most, tail=tail)
+            )
+            if phase in ("answer", "prepare", "fallback"):
+                what = f"{name}: at most {limit:g} ms"
+                checks.append(Check(phase, what, most <= limit, f"{most:.3g} ms of {len(ms)}"))
+            if tail and not tail.rejected:
+                what = f"all but {tail.exceedance:g} of the blocks: at most {limit:g} ms"
+                text = f"{tail.upper:.3g} ms with confidence {tail.confidence:.0%}"
+                checks.append(Check(phase, what, tail.upper <= limit, text))
+    hardest = tuple(
+        Hardest(name=name, most=int(everything[:, COLUMNS.index(name)].max()), bound=bound)
+        for name, bound in (
+            ("iterations", rig.most_iterations), ("qp_steps", rig.most_qp_steps),
+            ("instructions", 0),
+        )
+        if name != "instructions" or not missing
+    )  # fmt: skip
+    for one in hardest:
+        if one.bound:
+            text = f"{one.most} of {len(everything)} feedbacks"
+            what = f"by construction at most {one.bound} {one.name}"
+            checks.append(Check("work of a feedback", what, one.most <= one.bound, text))
+    checks.sort(key=lambda one: one.subject)
+    result = TimingResult(
+        car=settings.car.name, tracks=tuple(one.track.name for one in rig.tracks),
+        rate_hz=settings.rate_hz, limit_ms=limit, horizon=rig.horizon,
+        cycles={"recorded": sum(map(len, recorded)), "adversarial": len(adversarial)},
+        times=tuple(times), hardest=hardest, counter=missing,
+        worst=tuple(
+            f"{case.kind} on {rig.tracks[case.track].track.name}: "
+            f"{int(rows[:, 4].max())} iterations, {int(rows[:, 5].max())} QP steps"
+            for case, rows in found[:5]
+        ),
+        statement=_statement(next(one for one in times if one.name == "recorded answer")),
+    )  # fmt: skip
+    return Study(result, Verdict("timing", tuple(checks)), values)
+
+
+def _statement(answer: Times) -> str:
+    tail = answer.tail
+    if tail is None or tail.rejected:
+        why = f"the fit is rejected: {tail.rejected}" if tail else "too few different times"
+        return f"The answer took at most {answer.max:.3g} ms; nothing is stated beyond it: {why}."
+    return (
+        f"The controller answers within {tail.upper:.3g} ms with confidence {tail.confidence:.0%} "
+        f"in all but {tail.exceedance:g} of the blocks of {_BLOCK} cycles after a launch, on this "
+        f"machine, undisturbed, with these tracks and weights (shape {tail.shape:.2f}, "
+        f"{tail.peaks} peaks, goodness of fit p = {tail.goodness_p:.2f})."
+    )
