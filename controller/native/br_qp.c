@@ -16,12 +16,7 @@
 
 #define POSITIVE_DEFINITE 1e-10 /* smallest pivot, relative to the largest diagonal entry */
 
-/* Shares of the proximal term: of what a bound or a hard row holds anyway; of the rest, the least,
- * the most, and from one try to the next. */
-#define HELD 16.0
-#define LEAST_DAMPING 1e-3
-#define MOST_DAMPING 16.0
-#define MORE_DAMPING 4.0
+#define HELD 16.0 /* share of the proximal term of what a bound or a hard row holds anyway */
 
 void br_qp_init(br_qp *qp) {
     DAQPWorkspace *work = &qp->daqp;
@@ -186,8 +181,8 @@ static void add_proximal_held(br_mpc *mpc) {
         }
     fill_sensitivities(qp, 0, BR_NR_EARLY);
     for (int r = 0; r < BR_NR_EARLY; ++r)
-        for (int k = 0; !BR_ROW_SOFT[r] && k < BR_N; ++k) {
-            if (multiplier[BR_ROW(r, k)] == 0) continue;
+        for (int k = 0; k < BR_N; ++k) {
+            if (BR_ROW_SOFT[r] || multiplier[BR_ROW(r, k)] == 0) continue;
             const int columns = BR_NU * (BR_BLOCK_OF(k) + 1);
             double a[BR_M], norm2 = 0;
             for (int i = 0; i < columns; ++i) {
@@ -211,17 +206,19 @@ static void add_proximal(br_mpc *mpc, double damping) {
 
 /* The factor of the Hessian with this share of the dynamics' and the rows' part. Of the proximal
  * term it has as little as makes it positive definite: a Newton step, where the whole one would be
- * a small part of the way. Returns the share of that term; 0 if there is no factor. */
+ * a small part of the way. Returns the share of that term, 1 where the problem has none; 0 if there
+ * is no factor. */
 static double damped_factor(br_mpc *mpc, double curvature) {
+    static const double dampings[] = {0.001, 0.004, 0.016, 0.064, 0.256, 1.024, 4.096};
     br_qp *qp = &mpc->qp;
     br_condense_hessian(mpc, curvature);
     if (!BR_PROXIMAL) return cholesky(qp);
     add_proximal_held(mpc);
     memcpy(qp->undamped, qp->h, sizeof qp->undamped);
-    for (double damping = LEAST_DAMPING; damping <= MOST_DAMPING; damping *= MORE_DAMPING) {
+    for (int attempt = 0; attempt < 7; ++attempt) {
         memcpy(qp->h, qp->undamped, sizeof qp->undamped);
-        add_proximal(mpc, damping);
-        if (cholesky(qp)) return damping;
+        add_proximal(mpc, dampings[attempt]);
+        if (cholesky(qp)) return dampings[attempt];
     }
     return 0;
 }
@@ -238,7 +235,7 @@ void br_qp_factorise(br_mpc *mpc) {
     br_condense_states(mpc);
     for (int attempt = 0; attempt < 4; ++attempt) {
         const double damping = damped_factor(mpc, curvature[attempt]);
-        if (!(damping > 0)) continue;
+        if (damping == 0) continue;
         qp->curvature = curvature[attempt];
         qp->regularised = attempt > 0 || damping > 1;
         transform(qp);
