@@ -49,33 +49,34 @@ def step(artefact: Path, car: Car, weights: Weights, circuit: Circuit) -> Native
     return ready(artefact, car, weights, circuit, MpcSettings())
 
 
-def test_the_converged_step_is_the_solution_of_ipopt(
+def test_the_converged_step_is_the_solution_of_ipopt_after_few_iterations(
     step: NativeStep, car: Car, weights: Weights, circuit: Circuit
 ) -> None:
-    """From the plan that drives; the proximal term makes the last digits slow."""
-    exact = EXACT.model_copy(update={"iterations": 300, "tolerance": 1e-8})
+    """From the plan that drives; the feet on the line stay where they are."""
+    exact = EXACT.model_copy(update={"iterations": 100, "tolerance": 1e-8})
     f = corrected_function(e_kinematic(car), PREDICTION, weights)
     ocp = OcpNlp(problem_of(PROGRESS), f, HORIZON, options=TIGHT_IPOPT | FROM_OUR_PLAN)
     plant, values = discrete(dynamic(car)), exact.parameters(car, "progress")
-    x, d, compared = circuit.start(), 0.0, 0
+    x, d, iterations = circuit.start(), 0.0, list[int]()
     for k in range(120):
         assert step.step(x, d).usable
         u = step.u.copy()
-        if k % 15 == 10:
+        if k % 10 == 9:
             reference = step.read_reference()
             step.set_parameters(car, exact)
             status = step.solve(x, d, reference, elapsed_s=0.0)
             assert status.usable
             if status is Status.CONVERGED:
-                compared += 1
+                iterations.append(step.info.iterations)
                 plan = step.read_plan()
                 oracle = ocp.solve(x, d, reference, values, plan)
                 assert oracle.success, oracle.status
-                np.testing.assert_allclose(plan[1], oracle.u, rtol=0, atol=1e-3)
+                np.testing.assert_allclose(plan[1], oracle.u, rtol=0, atol=1e-4)
                 assert step.info.cost == pytest.approx(oracle.cost, rel=1e-6, abs=1e-8)
             step.set_parameters(car, MpcSettings())
         d, x = float(u[0]), plant(x, u)
-    assert compared >= 4
+    assert len(iterations) >= 10  # of 12
+    assert np.median(iterations) <= 5
 
 
 def time_on_line(table: PathTable, xy: Floats) -> float:

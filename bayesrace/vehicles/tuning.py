@@ -225,7 +225,7 @@ class ProgressTuning(_Section):
     q_contour: float = _number(0.1, "squared distance to the line [1/m^2]")
     gain: float = _number(2.5, "reward of the time that the line takes for the progress [1/s]")
     r_duty: float = _number(2e-4, "R: squared change of the drive command [1/command^2]")
-    r_delta_rate: float = _number(1e-6, "R: squared steering rate [s^2/rad^2]")
+    r_delta_rate: float = _number(2e-4, "R: squared steering rate [s^2/rad^2]")
     proximal_duty: float = _number(0.02, "of the command's change in a QP [1/command^2]", ge=0)
     proximal_delta_rate: float = _number(1e-3, "of the rate's change in a QP [s^2/rad^2]", ge=0)
     s_slack: float = _number(1000.0, "S: squared track violation [1/m^2]")

@@ -229,6 +229,7 @@ def c_header(problem: Problem) -> str:
         f"#define BR_CURVATURE_LATE {int(late)} /* second derivatives depend on p or u_before */",
         f"#define BR_HAS_PATH {int(bool(problem.path))}",
         f"#define BR_FOLLOWS_PLAN {int(problem.follows_plan)}",
+        f"#define BR_PROXIMAL {int(any(one.proximal for one in inputs))}",
         *(f"#define BR_INDEX_{role.upper()} {problem.role(role)}" for role in problem.path),
         *(f"#define BR_{n.upper()} {float(v)!r}" for n, v in problem.constants.items()),
         *_struct("br_mpc_reference", problem.stage_parameters),

@@ -68,8 +68,9 @@ class Input:
     odd: bool = False
     """As :attr:`State.odd`."""
     proximal: float = 0.0
-    """Weight of half the squared change of this input in one QP. Not part of the cost: the plan
-    that the iterations converge to is the same. For a cost that is linear in much of the plan."""
+    """Weight of half the squared change of this input in one QP, which takes as little of it as
+    convexity needs: controller/native/br_qp.c. Not part of the cost: the plan that the iterations
+    converge to is the same. For a cost that is linear in much of the plan."""
 
 
 @dataclass(frozen=True)

@@ -8,9 +8,9 @@ finds it anew before each QP. So the problem needs no virtual state for theta an
 that of Liniger, Domahidi and Morari ("Optimization-based autonomous racing of 1:43 scale RC cars",
 2015) does. t is the line's direction and tau' = 1 / ((1 - kappa n) v_line) the time that the line
 takes for a metre of the car's way at distance n from it: what is maximised is the time on the line
-that the car gets ahead by within the horizon. That cost is linear where it counts, so the QP is
-kept near the plan by a proximal term. A stage with ``follows = 0``, for a stop or a turn, tracks
-the point (x, y) as :mod:`bayesrace.codegen.problems.tracking` does;
+that the car gets ahead by within the horizon. That cost is linear where it counts, so the QP has a
+proximal term, as small as convexity allows. A stage with ``follows = 0``, for a stop or a turn,
+tracks the point (x, y) as :mod:`bayesrace.codegen.problems.tracking` does;
 :mod:`bayesrace.codegen.problems.driving` has the rest.
 """
 

@@ -113,12 +113,10 @@ static void hessian_rows(br_mpc *mpc, int k, double tau, double (*restrict p)[BR
     }
 }
 
-/* What of the cost couples the inputs of stage k with each other and with those before, and the
- * proximal term. */
+/* What of the cost couples the inputs of stage k with each other and with those before. */
 static void add_input_curvature(br_qp *qp, int k) {
     const int i = BR_NU * BR_BLOCK_OF(k), before = i - BR_NU, opens = br_opens_block(k);
     double (*uu)[2 * BR_NU] = qp->second[k].uu;
-    for (int a = 0; a < BR_NU; ++a) qp->h[i + a][i + a] += BR_INPUT_PROXIMAL[a];
     for (int a = 0; a < BR_NU; ++a)
         for (int b = 0; b < BR_NU; ++b) {
             const double later = k + 1 < BR_N ? qp->second[k + 1].uu[BR_NU + a][BR_NU + b] : 0.0;

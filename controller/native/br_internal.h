@@ -83,8 +83,9 @@ typedef struct {
     double penalty[BR_NR];                       /* of the soft rows */
     BR_ALIGNED double g[BR_N + 1][BR_NX][BR_MP]; /* sensitivity of stage k to all blocks */
     BR_ALIGNED double costate[2][BR_NX][BR_MP];
-    BR_ALIGNED double h[BR_M][BR_MP];   /* condensed Hessian, then its Cholesky factor */
-    BR_ALIGNED double y[BR_M][BR_COLS]; /* L^{-1} [A' | gradient] */
+    BR_ALIGNED double h[BR_M][BR_MP]; /* condensed Hessian, then its Cholesky factor */
+    BR_ALIGNED double undamped[BR_PROXIMAL ? BR_M : 1][BR_MP]; /* h before its proximal term */
+    BR_ALIGNED double y[BR_M][BR_COLS];                        /* L^{-1} [A' | gradient] */
     double diagonal[BR_M];
     double xbar[BR_N + 1][BR_NX];
     double gradient[BR_M];

@@ -16,6 +16,8 @@
 
 #define POSITIVE_DEFINITE 1e-10 /* smallest pivot, relative to the largest diagonal entry */
 
+#define HELD 16.0 /* share of the proximal term of what a bound or a hard row holds anyway */
+
 void br_qp_init(br_qp *qp) {
     DAQPWorkspace *work = &qp->daqp;
     memset(work, 0, sizeof *work);
@@ -166,6 +168,61 @@ static void transform(br_qp *qp) {
     fill_rows(qp, 0, BR_ROW_LATE);
 }
 
+/* The proximal term of what the plan's active bounds and hard rows hold, which changes a step only
+ * where it leaves them: it makes the Hessian convex in the directions that are not free. That of a
+ * row a dU is as large, in the norm of the inputs' terms, as that of a bound. */
+static void add_proximal_held(br_mpc *mpc) {
+    br_qp *qp = &mpc->qp;
+    const double *multiplier = mpc->plan.multiplier;
+    for (int k = 0; k < BR_N; ++k)
+        for (int c = 0; c < BR_NU; ++c) {
+            const int i = BR_NU * BR_BLOCK_OF(k) + c;
+            if (multiplier[i] != 0) qp->h[i][i] += HELD * BR_INPUT_PROXIMAL[c];
+        }
+    fill_sensitivities(qp, 0, BR_NR_EARLY);
+    for (int r = 0; r < BR_NR_EARLY; ++r)
+        for (int k = 0; k < BR_N; ++k) {
+            if (BR_ROW_SOFT[r] || multiplier[BR_ROW(r, k)] == 0) continue;
+            const int columns = BR_NU * (BR_BLOCK_OF(k) + 1);
+            double a[BR_M], norm2 = 0;
+            for (int i = 0; i < columns; ++i) {
+                a[i] = qp->y[i][BR_ROW(r, k)];
+                if (a[i] != 0) norm2 += a[i] * a[i] / BR_INPUT_PROXIMAL[i % BR_NU];
+            }
+            for (int i = 0; norm2 > 0 && i < columns; ++i)
+                for (int j = 0; j <= i; ++j) qp->h[i][j] += HELD / norm2 * a[i] * a[j];
+        }
+}
+
+/* That of all other inputs. */
+static void add_proximal(br_mpc *mpc, double damping) {
+    br_qp *qp = &mpc->qp;
+    for (int k = 0; k < BR_N; ++k)
+        for (int c = 0; c < BR_NU; ++c) {
+            const int i = BR_NU * BR_BLOCK_OF(k) + c;
+            if (mpc->plan.multiplier[i] == 0) qp->h[i][i] += damping * BR_INPUT_PROXIMAL[c];
+        }
+}
+
+/* The factor of the Hessian with this share of the dynamics' and the rows' part. Of the proximal
+ * term it has as little as makes it positive definite: a Newton step, where the whole one would be
+ * a small part of the way. Returns the share of that term, 1 where the problem has none; 0 if there
+ * is no factor. */
+static double damped_factor(br_mpc *mpc, double curvature) {
+    static const double dampings[] = {0.001, 0.004, 0.016, 0.064, 0.256, 1.024, 4.096};
+    br_qp *qp = &mpc->qp;
+    br_condense_hessian(mpc, curvature);
+    if (!BR_PROXIMAL) return cholesky(qp);
+    add_proximal_held(mpc);
+    memcpy(qp->undamped, qp->h, sizeof qp->undamped);
+    for (int attempt = 0; attempt < 7; ++attempt) {
+        memcpy(qp->h, qp->undamped, sizeof qp->undamped);
+        add_proximal(mpc, dampings[attempt]);
+        if (cholesky(qp)) return dampings[attempt];
+    }
+    return 0;
+}
+
 /* All that needs neither the measured state nor the reference. With the exact Hessian if that is
  * positive definite in the inputs; else with less and less of the dynamics' and the rows' part,
  * down to that of the cost alone, which always is. */
@@ -177,10 +234,10 @@ void br_qp_factorise(br_mpc *mpc) {
     br_evaluate_curvature(mpc);
     br_condense_states(mpc);
     for (int attempt = 0; attempt < 4; ++attempt) {
-        br_condense_hessian(mpc, curvature[attempt]);
-        if (!cholesky(qp)) continue;
+        const double damping = damped_factor(mpc, curvature[attempt]);
+        if (damping == 0) continue;
         qp->curvature = curvature[attempt];
-        qp->regularised = attempt > 0;
+        qp->regularised = attempt > 0 || damping > 1;
         transform(qp);
         mpc->valid[BR_FACTORS] = 1;
         return;
