@@ -99,8 +99,8 @@ static int control(const double nominal[BR_NX]) {
 int main(void) {
     void *memory = aligned_alloc(64, (br_mpc_memory_size() + 63) / 64 * 64);
     CHECK(memory && br_mpc_init(memory, br_mpc_memory_size(), &mpc) == BR_OK);
-    const br_mpc_parameters parameters = {1, .002, 3e-5, 100,  .01, -.1, 1, .35,
-                                          5, 1e-6, .1,   1e-4, 1.6, 3,   30};
+    const br_mpc_parameters parameters = {1, .002, 3e-5, 100,  .01, -.1, 1,  .35,
+                                          5, 1e-6, .1,   1e-4, 1.6, 3,   30, 4000};
     CHECK(br_mpc_set_parameters(mpc, &parameters) == BR_OK);
     make_circle();
     CHECK(br_mpc_set_path(mpc, &table[0][0], ROWS, 6.283185307179586 / ROWS) == BR_OK);
