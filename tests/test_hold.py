@@ -134,7 +134,13 @@ class Controller:
         law = ScriptedLaw(lambda _: StepOutput(u=np.array([0.5, 0.0]), plan_u=NO_PLAN))
         self.driver = scripted_driver(artefact, law, **settings)
         self.service = Service(
-            MagicMock(), MagicMock(), "orca", 50.0, self.driver, dict, lambda: PRESENCE
+            MagicMock(),
+            MagicMock(),
+            "orca",
+            50.0,
+            self.driver,
+            lambda: {"ticks": 0},
+            lambda: PRESENCE,
         )
         self.clock, self._watched = clock, Watched(clock)
         self.service.hold = self._watched.watch
