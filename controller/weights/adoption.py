@@ -203,7 +203,6 @@ class Adoption:
             self._step.prove_weights()
         else:
             self.reverted += 1
-            self.slow = None  # it was of the weights that are left
             self._step.revert_weights()
 
     def _slowed_down(self, fastest_mps: float) -> Environment:

@@ -7,8 +7,6 @@ the car goes back only to what is no worse; going back restores the weights to t
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -17,7 +15,7 @@ from bayesrace.arrays import Floats
 from bayesrace.controller.assembly import make_path_table
 from bayesrace.controller.native_step import NativeStep
 from bayesrace.controller.settings import SAMPLES, WATCHED, GateSettings, MpcSettings
-from bayesrace.controller.weights.adoption import Adoption, Ruling, Watch
+from bayesrace.controller.weights.adoption import Ruling, Watch
 from bayesrace.gp.weights import Weights, pack_weights, zero_weights
 from bayesrace.vehicles import Car
 from tests.conftest import Circuit, fit_weights, smooth_drive
@@ -236,21 +234,3 @@ def test_going_back_restores_the_proven_weights_to_the_bit(
     step.prove_weights()
     step.revert_weights()
     assert predicted() not in (other, proven)
-
-
-def test_going_back_lifts_the_limit_on_the_speed(
-    step: NativeStep, honest: Weights, again: Weights, car: Car
-) -> None:
-    """It was of the weights that are left: the proven ones drive as fast as before."""
-    adopt(step, honest)
-    step.prove_weights()
-    history = SimpleNamespace(in_use=SimpleNamespace(proven=True))
-    port: Any = SimpleNamespace(step=step, car=car, history=history)
-    adoption = Adoption(port, GateSettings())
-    step.stage_weights(pack_weights(again))
-    adoption.adopt("again", watched=True)
-    adoption._rule(Ruling("slow", "", {"fastest_mps": 2.0}))
-    assert adoption.limits(1.0) is not None
-    adoption._rule(Ruling("back", "", {}))
-    assert adoption.limits(1.0) is None
-    assert adoption.reverted == 1

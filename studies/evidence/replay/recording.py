@@ -162,7 +162,7 @@ class _Messages:
             if not answered.lockstep and (how.states < 0 or how.prepared_s < 0):
                 unknown = unknown or "recorded by an earlier release, which does not say all of it"
             commands = tuple(self._commands(-1 if before is None else before.how.seq, seq))
-            limit_mps = self._limit_mps(sent, how)
+            limit_mps = self._limit_mps(how)
             before = Cycle(tuple(taken), answered, commands, limit_mps, sent, how, unknown)
             life.cycles.append(before)
             next_at = max(next_at, at + 1)
@@ -185,11 +185,15 @@ class _Messages:
             if event.kind in COMMANDS and isinstance(number, int) and after < number <= seq:
                 yield event.kind
 
-    def _limit_mps(self, sent: Actuation, how: Telemetry) -> float | None:
-        """A limit stays until other weights are in use."""
+    def _limit_mps(self, how: Telemetry) -> float | None:
+        """A limit stays until other weights are sent for, also where the watch goes back."""
+        limit_mps: float | None = None
         for event in self.events:
-            if event.kind == "weights_slowed" and event.data.get("version") == sent.weights_version:
-                begins, limit = event.data.get("cycle"), event.data.get("speed_limit_mps")
-                if isinstance(begins, int) and isinstance(limit, float) and begins <= how.tick:
-                    return limit
-        return None
+            begins = event.data.get("cycle")
+            if not isinstance(begins, int) or begins > how.tick:
+                continue
+            if event.kind == "weights_slowed":
+                limit_mps = float(event.data.get("speed_limit_mps", 0.0))
+            elif event.kind == "weights_accepted" or event.data.get("by") == "request":
+                limit_mps = None
+        return limit_mps
