@@ -22,6 +22,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
 from rich.console import Console
 
 from bayesrace.controller.assembly import compiled_controller
@@ -33,10 +34,10 @@ from bayesrace.operation.preparation import Prepared, prepare
 from bayesrace.operation.report.style import figure_style, write_png
 from bayesrace.operation.run_plan import RunPlan
 from bayesrace.operation.settings import PreparationSettings
-from bayesrace.operation.simulation import Link, SimulatedSystem
+from bayesrace.operation.simulation import SimulatedSystem
 from bayesrace.operation.terminal.terminal import Stages
 from bayesrace.plant.process_settings import PlantSettings
-from bayesrace.transport.relay import AGAIN
+from bayesrace.transport.relay import AGAIN, Link
 from benchmarks.harness import Row, arguments, report
 
 _DELAYS_MS = (0, 5, 10, 20, 30, 40, 60)
@@ -139,6 +140,7 @@ def worst(found: dict[Case, Driven]) -> dict[Case, Driven]:
 def picture(path: Path, found: dict[Case, Driven]) -> None:
     """A panel for each transport and loss; a cell for each delay and jitter."""
     best_s = min(one.flying_s for one in found.values())
+    by_link = {case[1:]: one for case, one in found.items()}
     with figure_style():
         figure = Figure(figsize=(11.0, 8.6), layout="constrained")
         panels = figure.subplots(4, len(_LOSSES), sharex=True, sharey=True)
@@ -151,9 +153,8 @@ def picture(path: Path, found: dict[Case, Driven]) -> None:
                 axes.set_xlim(-0.5, len(_DELAYS_MS) - 0.5)
                 axes.set_ylim(-0.5, len(_JITTERS_MS) - 0.5)
                 for x, y in product(range(len(_DELAYS_MS)), range(len(_JITTERS_MS))):
-                    case = Case("", ordered, buffered, loss, _DELAYS_MS[x], _JITTERS_MS[y], 0)
-                    one = next((v for k, v in found.items() if k[1:] == case[1:]), None)
-                    if one is not None:
+                    link = ordered, buffered, loss, _DELAYS_MS[x], _JITTERS_MS[y], 0
+                    if (one := by_link.get(link)) is not None:
                         _cell(axes, x, y, one, best_s)
         figure.supxlabel("delay each way [ms]", fontsize=9)
         figure.supylabel("jitter [ms]", fontsize=9)
@@ -169,16 +170,12 @@ def _cell(axes: Any, x: int, y: int, one: Driven, best_s: float) -> None:
     lost = 100 * (one.flying_s / best_s - 1)
     done = np.isfinite(one.flying_s)
     colour = "#D55E00" if one.off or not done else "#009E73" if lost <= 1 else "#F0E442"
-    axes.add_patch(_square(x, y, colour))
+    axes.add_patch(
+        Rectangle((x - 0.48, y - 0.48), 0.96, 0.96, color=colour, alpha=0.55, linewidth=0)
+    )
     text = f"{lost:.1f}" if done else "–"
     axes.text(x, y, text + (f"\n{one.off} off" if one.off else ""), ha="center", va="center",
               fontsize=6.5)  # fmt: skip
-
-
-def _square(x: int, y: int, colour: str) -> Any:
-    from matplotlib.patches import Rectangle
-
-    return Rectangle((x - 0.48, y - 0.48), 0.96, 0.96, color=colour, alpha=0.55, linewidth=0)
 
 
 def rows(found: dict[Case, Driven]) -> list[Row]:

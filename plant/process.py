@@ -66,12 +66,15 @@ _RELINKED_S = 2.0
 class PlantProcess:
     """Serves one car's runs over an open session."""
 
-    def __init__(self, session: Any, settings: PlantSettings, vehicle: Vehicle) -> None:
+    def __init__(
+        self, session: Any, settings: PlantSettings, vehicle: Vehicle, epoch: int | None = None
+    ) -> None:
+        """``epoch``: of its states; None: a random one, as two processes' must differ."""
         self._settings = settings
         self.name = settings.name or settings.car.name
         self._simulator = vehicle
         # Two processes started in one nanosecond on two machines must differ too.
-        self._epoch = secrets.randbits(62)
+        self._epoch = secrets.randbits(62) if epoch is None else epoch
         self._numbering = Numbering()
         self._heartbeat = Heartbeat(session, self.name, "plant")
         self._states = Publisher(session, STATE, self.name)

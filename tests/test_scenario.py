@@ -10,7 +10,6 @@ from rich.console import Console
 
 from bayesrace.errors import InputError
 from bayesrace.messages import QUANTITIES, Reading, State
-from bayesrace.operation.simulation import Link
 from bayesrace.operation.terminal.terminal import stages_on
 from bayesrace.plant.faults import READING_FAULTS, STATE_FAULTS, FaultPlayer, SensorFault
 from bayesrace.plant.process_settings import PlantSettings
@@ -25,6 +24,7 @@ from bayesrace.studies.evidence.scenario.description import (
 from bayesrace.studies.evidence.scenario.events import timeline
 from bayesrace.studies.evidence.scenario.run import Result, read_grid, run_scenarios, verdict_of
 from bayesrace.tracks import load_track
+from bayesrace.transport.relay import Link
 from tests.programs import ROOT
 
 ELSEWHERE = "endpoints = ['tcp/10.0.0.1:7447']"

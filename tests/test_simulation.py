@@ -19,11 +19,12 @@ from bayesrace.log import LogReader, LogWriter
 from bayesrace.messages import ACTUATION, EVENT, STATE, TELEMETRY, TRUTH, Event, Topic
 from bayesrace.operation.analysis.laps import laps_in
 from bayesrace.operation.run_plan import RunPlan
-from bayesrace.operation.simulation import Link, SimulatedSystem
+from bayesrace.operation.simulation import SimulatedSystem
 from bayesrace.operation.simulation.scheduler import Scheduler
 from bayesrace.plant.process_settings import PlantSettings
 from bayesrace.raceline import RaceLine, racing_line, write_raceline
 from bayesrace.tracks import write_track
+from bayesrace.transport.relay import Link
 from bayesrace.vehicles import Car
 from tests.conftest import Circuit
 

@@ -14,15 +14,40 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Final, NamedTuple
 
 from bayesrace.transport.endpoints import address_of, free_endpoint
 
-__all__ = ["AGAIN", "Relay"]
+__all__ = ["AGAIN", "IDEAL", "Link", "Relay"]
 
 AGAIN: Final = 4
 """After so many times the delay, two round trips, TCP sends again what was lost."""
 _DATAGRAM: Final = 1 << 16
+
+
+class Link(NamedTuple):
+    """What happens to the messages of one direction."""
+
+    delay_s: float = 0.0
+    jitter_s: float = 0.0
+    """Time on the way is uniform in ``delay_s`` ± ``jitter_s``."""
+    loss: float = 0.0
+    """Probability."""
+    ordered: bool = True
+    """As TCP: what is lost arrives later, and holds up what comes after it. Otherwise as UDP: it
+    does not arrive, and later messages overtake earlier ones."""
+
+    def loses(self, chance: random.Random) -> bool:
+        """Whether the next message is lost."""
+        return chance.random() < self.loss
+
+    def way_s(self, chance: random.Random, lost: bool) -> float:
+        """Time on the way, at least 0; of one that was ``lost`` until it has come once more."""
+        way_s = self.delay_s + chance.uniform(-self.jitter_s, self.jitter_s)
+        return max(way_s + (AGAIN * self.delay_s if lost else 0.0), 0.0)
+
+
+IDEAL: Final = Link()
 
 
 def _address(endpoint: str) -> tuple[str, int]:
@@ -40,18 +65,16 @@ def _opened() -> threading.Event:
 class _Way:
     """One direction over the link."""
 
-    random: random.Random
+    chance: random.Random
     open: threading.Event = field(default_factory=_opened)
-    delay_s: float = 0.0
-    jitter_s: float = 0.0
-    loss: float = 0.0
+    link: Link = IDEAL
     lost: int = 0
 
-    def draw(self) -> tuple[bool, float]:
-        """Of what passes next: whether it is lost, and how long it takes [s]."""
-        lost = self.random.random() < self.loss
+    def loses(self) -> bool:
+        """Whether what passes next is lost, which is counted."""
+        lost = self.link.loses(self.chance)
         self.lost += lost
-        return lost, self.delay_s + self.random.uniform(-self.jitter_s, self.jitter_s)
+        return lost
 
 
 class Relay:
@@ -76,14 +99,13 @@ class Relay:
         self.join()
 
     def set(self, delay_s: float = 0.0, jitter_s: float = 0.0, loss: float = 0.0) -> None:
-        """Time on the way, uniform in ``delay_s`` ± ``jitter_s``, and probability of a loss."""
+        """Of both directions: see :class:`Link`, whose order is that of the protocol."""
         for direction in self._ways:
-            self.set_way(direction, delay_s, jitter_s, loss)
+            self.set_way(direction, Link(delay_s, jitter_s, loss))
 
-    def set_way(self, direction: str, delay_s: float, jitter_s: float, loss: float) -> None:
+    def set_way(self, direction: str, link: Link) -> None:
         """The same of one direction."""
-        way = self._ways[direction]
-        way.delay_s, way.jitter_s, way.loss = delay_s, jitter_s, loss
+        self._ways[direction].link = link
 
     def hold(self, direction: str = "") -> None:
         """Nothing gets through any more; both directions without one."""
@@ -198,9 +220,9 @@ class Relay:
         def take() -> None:
             with suppress(OSError):
                 while data := receive():
-                    lost, delay_s = way.draw()
-                    if not lost and way.open.is_set():
-                        later = threading.Timer(max(delay_s, 0.0), deliver, (data,))
+                    if not way.loses() and way.open.is_set():
+                        way_s = way.link.way_s(way.chance, lost=False)
+                        later = threading.Timer(way_s, deliver, (data,))
                         later.daemon = True
                         later.start()
 
@@ -220,9 +242,8 @@ class Relay:
             due_s = 0.0
             with suppress(OSError):
                 while data := receive():
-                    lost, delay_s = way.draw()
-                    delay_s += AGAIN * way.delay_s if lost else 0.0
-                    due_s = max(due_s, time.monotonic() + delay_s)
+                    way_s = way.link.way_s(way.chance, way.loses())
+                    due_s = max(due_s, time.monotonic() + way_s)
                     waiting.put((due_s, data))
             waiting.put((0.0, b""))
 

@@ -5,7 +5,7 @@ process, on a clock and a network that are simulated. A run is the same to the b
 with the links that a relay emulates, :mod:`.system` starts the processes and directs a run.
 """
 
-from bayesrace.operation.simulation.network import IDEAL, Direction, Link
-from bayesrace.operation.simulation.system import SimulatedSystem, Work
+from bayesrace.operation.simulation.network import Direction
+from bayesrace.operation.simulation.system import SimulatedSystem
 
-__all__ = ["IDEAL", "Direction", "Link", "SimulatedSystem", "Work"]
+__all__ = ["Direction", "SimulatedSystem"]

@@ -9,31 +9,15 @@ import random
 from collections import deque
 from collections.abc import Callable
 from types import SimpleNamespace
-from typing import Any, Final, NamedTuple
+from typing import Any
 
 import zenoh
 
 from bayesrace.operation.simulation.scheduler import Scheduler
 from bayesrace.transport import NEWEST
-from bayesrace.transport.relay import AGAIN
+from bayesrace.transport.relay import IDEAL
 
-__all__ = ["IDEAL", "Direction", "Link", "Network", "Session"]
-
-
-class Link(NamedTuple):
-    """What happens to the messages of one direction."""
-
-    delay_s: float = 0.0
-    jitter_s: float = 0.0
-    """Time on the way is uniform in ``delay_s`` ± ``jitter_s``."""
-    loss: float = 0.0
-    """Probability."""
-    ordered: bool = True
-    """As TCP: what is lost arrives later, and holds up what comes after it. Otherwise as UDP: it
-    does not arrive, and later messages overtake earlier ones."""
-
-
-IDEAL: Final = Link()
+__all__ = ["Direction", "Network", "Session"]
 
 
 class Direction:
@@ -49,14 +33,12 @@ class Direction:
     def send(self, deliver: Callable[[], None]) -> None:
         """Calls ``deliver`` when the message arrives, if it does."""
         link, now_ns = self.link, self._scheduler.monotonic_ns()
-        lost = self._random.random() < link.loss
+        lost = link.loses(self._random)
         self.lost += lost
         if not link.ordered and (lost or self.held):
             self.lost += not lost
             return
-        way_s = link.delay_s + self._random.uniform(-link.jitter_s, link.jitter_s)
-        way_s += AGAIN * link.delay_s if lost else 0.0
-        arrives_ns = now_ns + max(round(way_s * 1e9), 0)
+        arrives_ns = now_ns + round(1e9 * link.way_s(self._random, lost))
         if link.ordered:
             arrives_ns = self._free_ns = max(self._free_ns, arrives_ns)
         self._scheduler.call_at(arrives_ns, lambda: self._arrive(deliver))

@@ -3,7 +3,7 @@
 import time
 from collections.abc import Callable
 from functools import partial
-from typing import Any, Final, Literal, NamedTuple, Self, TypeVar
+from typing import Any, Final, Literal, Self, TypeVar
 
 from bayesrace import clock
 from bayesrace.controller.interface import Controller
@@ -18,7 +18,6 @@ from bayesrace.messages import (
     ROLLBACK,
     RUN,
     STATUS,
-    STOP,
     WEIGHTS,
     Command,
     Event,
@@ -28,23 +27,23 @@ from bayesrace.messages import (
     Service,
     Status,
     StatusRequest,
-    StopRequest,
     car_key,
     decode,
     encode,
 )
 from bayesrace.operation.closed_loop import built_in_car
 from bayesrace.operation.run_plan import RunPlan, announcement, run_request
-from bayesrace.operation.simulation.network import IDEAL, Direction, Link, Network, Query, Session
+from bayesrace.operation.simulation.network import Direction, Network, Query, Session
 from bayesrace.operation.simulation.scheduler import Scheduler, Task
 from bayesrace.plant.process import PlantProcess
 from bayesrace.plant.process_settings import PlantSettings
 from bayesrace.plant.vehicle import Vehicle
 from bayesrace.realtime import uncollected
 from bayesrace.tracks import Track
+from bayesrace.transport.relay import IDEAL, Link
 from bayesrace.transport.requests import in_transport_thread
 
-__all__ = ["Part", "SimulatedSystem", "Work"]
+__all__ = ["Part", "SimulatedSystem"]
 
 A = TypeVar("A", bound=Message)
 
@@ -53,22 +52,16 @@ Part = Literal["plant", "controller"]
 _PLANT: Final = "plant"
 _CONTROLLER: Final = "controller"
 _EPOCH: Final = 1
+_REASON: Final = "asked for"
 
 _LOOK_NS: Final = 1_000_000
 """Between two looks for an answer, or for the end of a run."""
 _PATIENCE_S: Final = 30.0
 """For work that takes real time, such as judging weights."""
-
-
-class Work(NamedTuple):
-    """How long the controller's work takes in simulated time."""
-
-    look_us: float = 15.0
-    """From one look of the compiled step at its clock to the next; it looks once an iteration, so
-    a step that takes more of them takes longer, and is cut short by its budget as in real time."""
-
-
-WORK: Final = Work()
+_OVERTIME_S: Final = 300.0
+"""After a run's time limit; it has ended long before."""
+_LOOK_US: Final = 15.0
+"""From one look of the compiled step at its clock to the next."""
 
 
 class SimulatedSystem:
@@ -90,38 +83,39 @@ class SimulatedSystem:
         vehicle: Vehicle | None = None,
         link: Link = IDEAL,
         seed: int = 0,
-        work: Work = WORK,
+        look_us: float = _LOOK_US,
     ) -> None:
         """``make_controller``: of each controller process that is started. ``vehicle``: what plays
         the car; the built-in equations in ``plant.changes`` without. ``link``: each way between the
-        two; ``seed``: of what is random about it."""
+        two; ``seed``: of what is random about it. ``look_us``: simulated time from one look of the
+        compiled step at its clock to the next. It looks once an iteration, so a step that takes
+        more of them takes longer, and is cut short by its budget as in real time."""
         self._track, self._make_controller, self._log = track, make_controller, log
         self._plant = plant or PlantSettings()
         self._controller = controller or ControllerSettings(car=self._plant.car)
         self.car = self._plant.name or self._plant.car.name
         self._vehicle = vehicle or built_in_car(self._plant.car, self._plant.changes)
-        self._work_ns = round(work.look_us * 1e3)
+        self._look_ns = round(look_us * 1e3)
         self._scheduler = Scheduler()
-        self.network = Network(self._scheduler, (_PLANT, _CONTROLLER), seed)
+        self._network = Network(self._scheduler, (_PLANT, _CONTROLLER), seed)
         self.ways: dict[Part, Direction] = {
-            _CONTROLLER: self.network.ways[_PLANT, _CONTROLLER],
-            _PLANT: self.network.ways[_CONTROLLER, _PLANT],
+            _CONTROLLER: self._network.ways[_PLANT, _CONTROLLER],
+            _PLANT: self._network.ways[_CONTROLLER, _PLANT],
         }
         """Between the two, by who receives; set their ``link``, ``hold`` and ``release`` them."""
         for way in self.ways.values():
             way.link = link
-        self.plant: PlantProcess | None = None
         self.controller: ControllerProcess | None = None
         """The one that runs, or ran last."""
         self._running: dict[str, tuple[Session, Task]] = {}
         self._timeline: list[tuple[float, Callable[[], object]]] = []
         self._ends: list[Event] = []
-        self._started_ns = self._runs = 0
+        self._runs = 0
 
     def __enter__(self) -> Self:
         self._clock = clock.simulated(self._scheduler)
         self._clock.__enter__()
-        self._session = self.network.session("director")
+        self._session = self._network.session("director")
         self._session.declare_subscriber(
             car_key(EVERYTHING, self.car), in_transport_thread(self._record)
         )
@@ -144,7 +138,7 @@ class SimulatedSystem:
         """Starts a process that does not run."""
         if part in self._running:
             raise InputError(f"the {part} runs already; kill it first")
-        session = self.network.session(part)
+        session = self._network.session(part)
         run = self._started_plant if part == _PLANT else self._started_controller
         process = run(session)
         self._running[part] = session, self._scheduler.start(part, process.serve)
@@ -155,7 +149,7 @@ class SimulatedSystem:
         if part not in self._running:
             raise InputError(f"the {part} does not run; start it first")
         session, task = self._running.pop(part)
-        self.network.close(session)
+        self._network.close(session)
         self._scheduler.end(task)
 
     def pause(self, part: str, seconds: float) -> None:
@@ -173,13 +167,22 @@ class SimulatedSystem:
         return self._command("go")
 
     def _command(self, command: str) -> Reply:
-        now_ns, text = clock.monotonic_ns(), "asked for"
-        return self.ask(COMMAND, Command(seq=0, source_time_ns=now_ns, command=command, text=text))
+        now_ns = clock.monotonic_ns()
+        request = Command(seq=0, source_time_ns=now_ns, command=command, text=_REASON)
+        return self.ask(COMMAND, request)
 
     def publish(self, weights: bytes) -> Reply:
         """New weights for the controller: its answer, when they are in use or refused. Judging them
         takes real time, and none of the simulation's."""
-        query = self._asked(WEIGHTS, weights)
+        return self._judged(self._asked(WEIGHTS, weights))
+
+    def roll_back(self) -> Reply:
+        """Back to the weights before."""
+        request = RollbackRequest(seq=0, source_time_ns=clock.monotonic_ns(), text=_REASON)
+        return self._judged(self._asked(ROLLBACK, encode(request)))
+
+    def _judged(self, query: Query) -> Reply:
+        """The answer of the controller's thread for weights, which lives in real time."""
         controller = self.controller
         adoption = None if controller is None else controller._adoption
         give_up = time.monotonic() + _PATIENCE_S
@@ -187,18 +190,9 @@ class SimulatedSystem:
             if adoption is not None and adoption.tasks:
                 self.sleep(1e-3)  # the control loop takes them between two cycles
             elif time.monotonic() > give_up:
-                raise InputError(f"no answer to new weights within {_PATIENCE_S:g} s")
+                raise InputError(f"no answer about weights within {_PATIENCE_S:g} s")
             else:
                 time.sleep(1e-3)
-        return decode(Reply, query.answer)
-
-    def roll_back(self) -> Reply:
-        """Back to the weights before."""
-        request = RollbackRequest(seq=0, source_time_ns=clock.monotonic_ns(), text="asked for")
-        query = self._asked(ROLLBACK, encode(request))
-        while query.answer is None:
-            self.sleep(1e-3)
-            time.sleep(1e-3)
         return decode(Reply, query.answer)
 
     # Runs ----------------------------------------------------------------------------------------
@@ -223,16 +217,11 @@ class SimulatedSystem:
                     break
                 action()
             self._timeline.clear()
-            self._sleep_in_run(begin_s + plan.max_time_s + 10 * _PATIENCE_S)
+            self._sleep_in_run(begin_s + plan.max_time_s + _OVERTIME_S)
         self._check()
         if not self._ends:
             raise InputError(f"run {plan.run} did not end")
         return self._ends[-1]
-
-    def stop_run(self) -> Reply:
-        """The plant ends the run at once."""
-        request = StopRequest(seq=0, source_time_ns=clock.monotonic_ns(), text="asked for")
-        return self.ask(STOP, request)
 
     def status(self, part: str) -> Status:
         """Of a process, as it answers."""
@@ -263,23 +252,21 @@ class SimulatedSystem:
 
     def _asked(self, service: Service[Any, Any], data: bytes, source: str = "") -> Query:
         try:
-            return self.network.ask(car_key(service.key, self.car, source), data)
+            return self._network.ask(car_key(service.key, self.car, source), data)
         except KeyError:
             raise InputError(f"nobody serves '{service.name}'; start the process") from None
 
     # Processes -----------------------------------------------------------------------------------
 
     def _started_plant(self, session: Session) -> PlantProcess:
-        self.plant = process = PlantProcess(session, self._plant, self._vehicle)
-        process._epoch = _EPOCH
-        return process
+        return PlantProcess(session, self._plant, self._vehicle, _EPOCH)
 
     def _started_controller(self, session: Session) -> ControllerProcess:
         if self.controller is not None:
             self.controller.close()
-        made = ControllerProcess(session, self._controller, self._make_controller())
-        self.controller = process = made
-        process._driver.live_by(partial(self._scheduler.work_s, self._work_ns))
+        process = ControllerProcess(session, self._controller, self._make_controller())
+        self.controller = process
+        process._driver.live_by(partial(self._scheduler.work_s, self._look_ns))
         return process
 
     def _check(self) -> None:

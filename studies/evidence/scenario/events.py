@@ -6,11 +6,11 @@ from typing import Annotated, Any, Literal, Protocol, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from bayesrace.operation.simulation import Link
 from bayesrace.operation.simulation.system import Part
 from bayesrace.plant.faults import SensorFault
 from bayesrace.plant.world import Change, What
 from bayesrace.tracks import Track
+from bayesrace.transport.relay import Link
 
 __all__ = ["Event", "System", "timeline"]
 

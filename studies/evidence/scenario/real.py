@@ -14,7 +14,6 @@ from bayesrace.configuration import Configuration, configured
 from bayesrace.files import read_whole, write_whole
 from bayesrace.messages import COMMAND, EVENT, STATUS, Command, Event, StatusRequest
 from bayesrace.operation.drive import execute
-from bayesrace.operation.simulation import Link
 from bayesrace.operation.simulation.system import Part
 from bayesrace.operation.system import CONFIGURATION, child, private_network, started_system
 from bayesrace.plant.faults import write_sensor_faults
@@ -33,7 +32,7 @@ from bayesrace.transport import (
     send_rollback,
     send_weights,
 )
-from bayesrace.transport.relay import Relay
+from bayesrace.transport.relay import Link, Relay
 from bayesrace.vehicles import car_text, write_car
 
 __all__ = ["drive_real"]
@@ -58,7 +57,7 @@ class _Processes:
         return self.relay
 
     def set_link(self, to: Part, link: Link) -> None:
-        self._link().set_way(_WAYS[to], link.delay_s, link.jitter_s, link.loss)
+        self._link().set_way(_WAYS[to], link)
 
     def hold(self, to: Part) -> None:
         self._link().hold(_WAYS[to])

@@ -7,11 +7,12 @@ from bayesrace.codegen.compiler import compiled
 from bayesrace.controller.assembly import predictive_controller
 from bayesrace.files import write_whole
 from bayesrace.log import LogWriter
-from bayesrace.operation.simulation import Link, SimulatedSystem
+from bayesrace.operation.simulation import SimulatedSystem
 from bayesrace.operation.simulation.system import Part
 from bayesrace.plant.vehicle import open_vehicle
 from bayesrace.studies.evidence.scenario.events import timeline
 from bayesrace.studies.evidence.scenario.preparing import Ready
+from bayesrace.transport.relay import Link
 
 __all__ = ["SETTLING_S", "drive_simulated"]
 
