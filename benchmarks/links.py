@@ -4,9 +4,9 @@
 
 Two laps by learned weights, for each link and seed; the worst seed counts. The loops of plant and
 controller run on a simulated clock and network (``operation/simulation``), so nothing depends on
-the machine. Without a jitter buffer, and with one that the controller is told of, as
-docs/results/links.md advises: by UDP twice the delay, the jitter and 5 ms; by TCP with losses four
-times the delay more, after which it sends again.
+the machine. Each link is driven without a jitter buffer, and with one whose delay the controller
+knows (``--delay``), as docs/results/links.md advises: by UDP twice the delay, the jitter and 5 ms;
+by TCP with losses four times the delay more, after which it sends again.
 """
 
 import io

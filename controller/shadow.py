@@ -2,10 +2,9 @@
 reach the car.
 
 It answers each actuation of the controller that drives, once it has the state that this answers: by
-that state, for the plant time of that decision, and with the inputs that are really on their way in
-place of its own. So it decides what it would do from here, in the situation that the other has
-brought about. Whoever drives does not know of it: it has no token, serves no requests, and sends on
-keys of its own.
+that state, for the plant time of that decision, and with the other's inputs on their way, not its
+own. So each decision begins where the car really is. The driving controller does not notice it: a
+shadow has no token, serves no requests, and sends on keys of its own.
 """
 
 import logging
@@ -82,7 +81,7 @@ class ShadowProcess:
             decoder.report(_log)
         if time.monotonic_ns() - self._newest_ns < _SILENT_S * 1e9:
             return
-        while self._states:  # the final one, which no input answers, or those of nobody's drive
+        while self._states:  # the final one, or those that no controller answers
             self._observe(*self._states.popleft())
         self._driver.lost(silent=True)
         if (session := renewed()) is not None:

@@ -134,7 +134,7 @@ br_mpc_error br_mpc_repeat(br_mpc *mpc, const int *refused, int count) {
     if (count < 0 || count > BR_REFUSALS) return BR_ERROR_PARAMETERS;
     mpc->timer.given = count;
     for (int i = 0; i < count; ++i) mpc->timer.refuse[i] = refused[i];
-    mpc->timer.told = 1;
+    mpc->timer.repeat_next = 1;
     return BR_OK;
 }
 

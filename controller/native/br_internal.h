@@ -200,7 +200,7 @@ typedef struct {
     double iteration, trial; /* longest seen, of the line search's trials too; 0: none yet */
     double caution;          /* what the last br_caution_update took */
     int checks, refusals, refused[BR_REFUSALS]; /* of the newest call: see br_mpc_get_refusals */
-    int told, repeats;                          /* br_mpc_repeat was called; it counts now */
+    int repeat_next, repeats; /* br_mpc_repeat: for the next call with a budget, for this one */
     int given, refuse[BR_REFUSALS];
 } br_timer;
 

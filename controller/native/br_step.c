@@ -14,8 +14,8 @@ static void start_timer(br_mpc *mpc, double budget) {
     timer->limited = timer->clock && budget > 0;
     timer->deadline = timer->limited ? br_timer_now(timer) + budget : 0;
     timer->checks = timer->refusals = 0;
-    timer->repeats = timer->limited && timer->told;
-    timer->told &= !timer->limited;
+    timer->repeats = timer->limited && timer->repeat_next;
+    timer->repeat_next &= !timer->limited;
 }
 
 /* --- the plan in step with time --- */
