@@ -13,7 +13,7 @@ import struct
 import threading
 import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -71,6 +71,8 @@ class Links:
         self._stamps, self._again_s, self._said = tuple[Any, ...](), 0.0, ""
         self._links: dict[tuple[str, str], _Link] = {}
         """By own end and other end, as Zenoh writes them."""
+        self.standing: Callable[[], Iterable[Any]] = tuple
+        """All that the session has now, as far as it can say so."""
         self._reported: set[str] = set()
         self._accepted: deque[str] = deque(maxlen=_MOST_ACCEPTED)
 
@@ -115,6 +117,7 @@ class Links:
     def clear(self) -> None:
         """The session, and so all links, have ended."""
         self._links.clear()
+        self.standing = tuple
 
     def on_event(self, event: Any) -> None:
         """A link that begins or ends; in the transport's thread, before messages come over it."""
@@ -132,19 +135,33 @@ class Links:
         """The name in the certificate of who sent a request; of a router, if it came over one.
 
         By what the request says of itself: a member could name the session of another one that has
-        a link here, whose number it would have to know. Empty without certificates.
+        a link here, whose number it would have to know. Empty without certificates, and for who has
+        no link here that may be.
         """
         if self.used is None:
             return ""
         names = {link.node: link.name for link in tuple(self._links.values())}
         source = query.source_info
-        if source is not None and (node := str(source.source_id.zid)) in names:
-            return names[node]
+        name = "" if source is None else names.get(str(source.source_id.zid), "")
+        if name:
+            return name if self._wanted(name) else ""
         members = self.used.members.members
         routers = [
             one for one in names.values() if one in members and members[one].role == "router"
         ]
-        return f"somebody at {', '.join(routers)}" if routers else "somebody"
+        return f"somebody at {', '.join(routers)}" if routers else ""
+
+    def admits(self, query: Any) -> bool:
+        """Whether a request may be served; in the transport's thread.
+
+        A link that may not be is closed as soon as it is noticed, but on a loaded machine a request
+        over it can be here before, or after it has gone.
+        """
+        if self.used is None or self.sender(query):
+            return True
+        for link in self.standing():  # one that has not been noticed yet
+            self.note(link)
+        return bool(self.sender(query))
 
     def accepted(self, text: str) -> None:
         """Something for the log, which the control loop does not wait for."""

@@ -239,7 +239,11 @@ class Request:
 
     def reject(self, why: str) -> None:
         """Answer with the error that the process is too busy, and ``why``."""
-        self._end(lambda query: query.reply_err(_BUSY + why))
+        self.refuse(_BUSY + why)
+
+    def refuse(self, why: str) -> None:
+        """Answer with an error."""
+        self._end(lambda query: query.reply_err(why))
 
     def _end(self, reply: Callable[[Any], None]) -> None:
         queries, self._queries = self._queries, []
@@ -268,7 +272,11 @@ def declare_service(
     links = LINKS.get(str(session.info.zid()))
 
     def on_query(query: Any) -> None:
-        on_request(Request(service, query, max_bytes, links))
+        request = Request(service, query, max_bytes, links)
+        if links is None or links.admits(query):
+            on_request(request)
+        else:
+            request.refuse("a request names its session, which is a member's with a link here")
 
     key = car_key(service.key, car, source)
     return session.declare_queryable(key, in_transport_thread(on_query))

@@ -351,8 +351,9 @@ def _opened(
             listener = session.info.declare_link_events_listener(on_link)
         with listener:
             if not endpoints.low_latency:  # as above
-                for link in session.info.links():
-                    links.note(link)
+                links.standing = session.info.links
+            for link in links.standing():
+                links.note(link)
             links.tend()
             number = str(session.info.zid())
             LINKS[number] = links

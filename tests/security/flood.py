@@ -11,6 +11,8 @@ import time
 from pathlib import Path
 from typing import Final
 
+import zenoh
+
 from bayesrace.messages import STATUS, StatusRequest, car_key, encode
 from tests.driven import blank
 from tests.security.authority import CAR
@@ -27,10 +29,10 @@ def main(endpoint: str, folder: str, source: str, rate: str) -> None:
     key, request, sent = car_key(STATUS.key, CAR, source), encode(blank(StatusRequest)), 0
     with bare_session(endpoint, Path(folder)) as session:
         print("asking", flush=True)  # noqa: T201
-        begin = time.monotonic()
+        begin, named = time.monotonic(), {"source_info": zenoh.SourceInfo(session.id, 0)}
         while not select.select([sys.stdin], [], [], _BATCH_S)[0]:
             for _ in range(int((time.monotonic() - begin) * int(rate)) - sent):
-                session.get(key, lambda _: None, payload=request, timeout=_TIMEOUT_S)
+                session.get(key, lambda _: None, payload=request, timeout=_TIMEOUT_S, **named)
                 sent += 1
         print(sent / (time.monotonic() - begin), flush=True)  # noqa: T201
 

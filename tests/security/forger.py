@@ -67,7 +67,10 @@ def forgeries(car: str, epoch: int, run: int) -> Iterator[tuple[str, bytes]]:
 def _ask(session: Any, car: str) -> None:
     """Asks car and controller to stop; nobody waits for the answer."""
     for service, request in ((STOP, blank(StopRequest)), (COMMAND, blank(Command, command="stop"))):
-        session.get(car_key(service.key, car), payload=encode(request), timeout=_ASK_S)
+        session.get(
+            car_key(service.key, car), payload=encode(request), timeout=_ASK_S,
+            source_info=zenoh.SourceInfo(session.id, 0),
+        )  # fmt: skip
 
 
 def _hold(endpoint: str, count: int, held: list[socket.socket]) -> None:

@@ -103,7 +103,8 @@ def _try_everything(ears: Any, mouth: Any) -> dict[str, list[str]]:
     for key in KEYS:
         mouth.put(key, FORGED, congestion_control=zenoh.CongestionControl.BLOCK)
         mouth.delete(key, congestion_control=zenoh.CongestionControl.BLOCK)
-    asked = [mouth.get(key, payload=FORGED, timeout=1.0) for key in KEYS]
+    named = zenoh.SourceInfo(mouth.id, 0)
+    asked = [mouth.get(key, payload=FORGED, timeout=1.0, source_info=named) for key in KEYS]
     answers = [one.ok.key_expr for replies in asked for one in replies if one.ok is not None]
     present = [one.ok.key_expr for one in mouth.liveliness().get("bayesrace/**") if one.ok]
     for key in ALIVE_KEYS:
