@@ -203,6 +203,26 @@ def test_a_budget_looks_for_no_other_plan(
     assert 0 < max(iterations) <= 4
 
 
+def test_what_is_prepared_knows_whether_the_plan_follows(
+    artefact: Path, car: Car, weights: Weights, circuit: Circuit
+) -> None:
+    """Where caution slows the car down, the reference is another one from a step to the next."""
+    step = ready(artefact, car, weights, circuit, MpcSettings())
+    plant = discrete(dynamic(car))
+    Clock(step, 1e-6)
+    x, d, paces, iterations = circuit.start(), 0.0, [1.0], list[int]()
+    for _ in range(400):
+        assert step.step(x, d).usable
+        paces.append(step.info.pace)
+        iterations.append(step.info.iterations)
+        step.prepare(budget_s=1.0)
+        d, x = float(step.u[0]), plant(x, step.u)
+    slowed = np.array(paces[:-1]) < 1
+    switches = slowed[1:] != slowed[:-1]
+    assert switches.sum() > 10
+    assert np.array(iterations)[1:][switches].max() <= 4  # of up to 7 where it is not foreseen
+
+
 def test_a_stop_brakes_to_standstill(step: NativeStep, car: Car, circuit: Circuit) -> None:
     plant = discrete(dynamic(car))
     x, d, limit = circuit.start(v_mps=1.5), 0.0, math.inf

@@ -340,16 +340,22 @@ static int take_environment(br_mpc *mpc, const br_environment *environment) {
     return 0;
 }
 
+#if BR_FOLLOWS_PLAN
+/* Whether the reference is the plan's own progress: not on the way to standstill, nor where the
+ * line's speeds are too uncertain or not known. */
+static int may_follow(const br_mpc *mpc) {
+    return !isfinite(mpc->path.speed_limit) && mpc->caution.pace >= 1 &&
+           br_path_known_ahead(&mpc->path);
+}
+#endif
+
 #if BR_HAS_PATH
 /* Points to track. Where the problem takes its reference from the plan instead, only a stop and a
  * turn need them, and a slow car, which a turn may begin with. */
 static void plan_reference(br_mpc *mpc) {
     br_note_standing(mpc);
 #if BR_FOLLOWS_PLAN
-    const int follows = !isfinite(mpc->path.speed_limit) && mpc->caution.pace >= 1 &&
-                        br_path_known_ahead(&mpc->path);
-    const int before = mpc->follows;
-    mpc->follows = follows;
+    const int before = mpc->follows, follows = mpc->follows = may_follow(mpc);
     if (follows && before && fabs(mpc->x0[BR_INDEX_VX]) >= BR_TURN_SLOW_MPS) return;
     br_invalidate(mpc, BR_FOLLOWED);
 #endif
@@ -415,11 +421,14 @@ static void foresee(br_mpc *mpc, double elapsed, int shifts) {
         memcpy(mpc->u_before, mpc->answer_u[shifts - 1], sizeof mpc->u_before);
     }
 #if BR_HAS_PATH
-    if (shifts && !mpc->follows) {
+    if (shifts) {
         double lateral;
         mpc->path.age += elapsed;
         br_path_project(&mpc->path, mpc->x0, &lateral);
-        br_path_plan(&mpc->path, mpc->caution.pace, mpc->reference);
+#if BR_FOLLOWS_PLAN
+        mpc->follows = may_follow(mpc);
+#endif
+        if (!mpc->follows) br_path_plan(&mpc->path, mpc->caution.pace, mpc->reference);
     }
 #endif
     br_invalidate(mpc, BR_FOLLOWED);
