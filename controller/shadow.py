@@ -27,7 +27,15 @@ from bayesrace.messages import (
 )
 from bayesrace.processes import die_with_parent
 from bayesrace.realtime import prepare_thread
-from bayesrace.transport import HEARTBEAT_S, NEWEST, Inbox, Kind, Publisher, open_sessions
+from bayesrace.transport import (
+    HEARTBEAT_S,
+    NEWEST,
+    Inbox,
+    Kind,
+    Publisher,
+    open_sessions,
+    unlinked,
+)
 
 __all__ = ["ShadowProcess", "main"]
 
@@ -58,6 +66,7 @@ class ShadowProcess:
         self._sent: deque[Actuation] = deque()
         """Inputs of the controller that drives, whose states have not come yet."""
         self._newest_ns = 0
+        self._session, self._linked = session, False
         self.answered = 0
         self.unanswered = 0
         """Inputs whose states have not come, or are not to be driven on."""
@@ -77,6 +86,9 @@ class ShadowProcess:
                 self._sent.popleft()
 
     def _rest(self, renewed: Callable[[], Any]) -> None:
+        if not self._linked and not unlinked(self._session, self._settings.endpoints):
+            self._linked = True
+            _log.info("shadow '%s' has its links", self._settings.shadow)
         for decoder in self._decoders:
             decoder.report(_log)
         if time.monotonic_ns() - self._newest_ns < _SILENT_S * 1e9:
@@ -85,6 +97,7 @@ class ShadowProcess:
             self._observe(*self._states.popleft())
         self._driver.lost(silent=True)
         if (session := renewed()) is not None:
+            self._session = session
             for one in (self._actuations, self._telemetry, self.inbox):
                 one.bind(session)
 

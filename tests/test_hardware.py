@@ -1,6 +1,7 @@
 """A real car behind the plant: its instruments' clocks, commands at once, and how its runs end."""
 
 import queue
+import re
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, nullcontext
@@ -217,7 +218,7 @@ def test_what_is_no_measurement_is_counted(car: Rolling) -> None:
     text = car.report()
     assert "4 unusable reports" in text
     assert "odd" not in text
-    assert "pose 100 Hz" in text or "pose 9" in text
+    assert re.search(r"\bpose [1-9]\d+ Hz", text)  # 100, and fewer on a loaded machine
 
 
 def test_a_clock_that_is_set_anew_is_followed(car: Rolling) -> None:

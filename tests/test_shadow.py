@@ -118,8 +118,8 @@ def rigged(
             words += ["--low-latency"] if lockstep else []
             running[name] = stack.enter_context(child(words, folder / f"{name}.log"))
         for one in running.values():
-            said(one, "shadow '")
-        time.sleep(0.3)  # its links and declarations
+            said(one, "has its links")
+        time.sleep(0.5)  # its declarations
         yield Rig(system, recorder, running, folder, racing, lockstep)
 
 

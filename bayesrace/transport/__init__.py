@@ -33,7 +33,7 @@ from bayesrace.transport.requests import (
     send_rollback,
     send_weights,
 )
-from bayesrace.transport.session import check_session, open_session, open_sessions
+from bayesrace.transport.session import check_session, open_session, open_sessions, unlinked
 
 __all__ = [
     "CONTROLLER_ENDPOINT", "HEARTBEAT_S", "LOCKSTEP_SPIN_S", "NEWEST", "PLANT_ENDPOINT", "POLL_S",
@@ -42,5 +42,5 @@ __all__ = [
     "ask", "ask_all", "check_descriptors", "count_processes", "decisive",
     "declare_service", "decode_request", "free_endpoint", "open_session", "open_sessions",
     "private_endpoints",
-    "send_rollback", "send_weights", "check_session",
+    "send_rollback", "send_weights", "check_session", "unlinked",
 ]  # fmt: skip
