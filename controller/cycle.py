@@ -78,7 +78,7 @@ class Cycle:
     ) -> None:
         """Answers a state of a lockstep run, then prepares for the next one."""
         self.timing.released_ns = clock.monotonic_ns()
-        send(state, self.decide(state.time_s, environment=environment))
+        send(state, self.decide(self.driver.time_s, environment=environment))
         self.prepare(self.driver.interval_s, 0.0)
 
     def decide(

@@ -154,6 +154,12 @@ class Driver:
         return interval_s
 
     @property
+    def time_s(self) -> float:
+        """Plant time of the newest state, which says another one where it is not believed."""
+        time_s: float = self._counters.time_s
+        return time_s
+
+    @property
     def levels(self) -> list[int]:
         """Cycles so far by level of the fallback; those on command are not among them."""
         return list(self._counters.levels)

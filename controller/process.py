@@ -230,7 +230,7 @@ class ControllerProcess:
         """Keeps the rate, until a state comes that is not to be driven on, or none for long."""
         schedule = self._schedule
         schedule.start(self._arrived_ns)
-        schedule.observe(self._arrived_ns, first.time_s, 0.0)
+        schedule.observe(self._arrived_ns, self._driver.time_s, 0.0)
         self._timing.wake_us = 0.0
         state, fresh, late = first, True, False
         while not self._service.stopping:
@@ -261,7 +261,7 @@ class ControllerProcess:
         budget_s = self._settings.budget * schedule.period_ns * 1e-9
         # What has held up a state on its way is part of its age: hence the schedule's plant time,
         # not the time since this state's own arrival.
-        decided_at_s = max(schedule.plant_time_s(timing.released_ns), state.time_s)
+        decided_at_s = max(schedule.plant_time_s(timing.released_ns), self._driver.time_s)
         spent_s = (clock.monotonic_ns() - schedule.release_ns) * 1e-9
         limits = self._limits()
         decision = self._cycle.decide(decided_at_s, budget_s, spent_s, limits)
@@ -345,7 +345,7 @@ class ControllerProcess:
         if fresh is not None:
             if fresh.run != run:
                 self._schedule.start(self._arrived_ns)
-            self._schedule.observe(self._arrived_ns, fresh.time_s, self._driver.interval_s)
+            self._schedule.observe(self._arrived_ns, self._driver.time_s, self._driver.interval_s)
         return fresh
 
     def _rehearse(self) -> None:
@@ -362,10 +362,10 @@ class ControllerProcess:
 
     def _missing(self) -> int:
         """How many states that have not come yet are due by the release."""
-        newest = self._driver.newest
-        if newest is None:
+        driver = self._driver
+        if driver.newest is None:
             return 0
-        return self._schedule.missing(newest.time_s, self._driver.interval_s)
+        return self._schedule.missing(driver.time_s, driver.interval_s)
 
     @property
     def _left_s(self) -> float:

@@ -164,6 +164,7 @@ typedef struct {
     int phase;      /* br_phase, at this moment */
     double delay_s; /* delay that is compensated, at this moment */
     double interval_s; /* plant time between two states in a row; 0: not known */
+    double time_s;     /* plant time of the newest state, as far as that is believed */
 } br_counters;
 
 /* What a cycle drives: the compiled controller (br_cycle_drive_mpc), or another with these

@@ -184,6 +184,7 @@ static void believe(br_cycle *cycle, double interval_s) {
                                        interval_s, &cycle->stream.newest);
     counters->faults[counters->fault] += counters->fault != BR_FAULT_NONE;
     counters->instrument = -1;
+    if (counters->fault) counters->interval_s = interval_s; /* its time may be wrong, too */
     cycle->doubt = counters->fault;
 }
 
@@ -310,6 +311,7 @@ br_reception br_cycle_observe(br_cycle *cycle, const br_measured *state) {
         believe(cycle, interval_s);
     }
     cycle->counters.doubted = cycle->unknown || cycle->doubt;
+    cycle->counters.time_s = cycle->stream.newest.time_s;
     const int begun = state->estimated && !cycle->estimator.agreed; /* here, perhaps elsewhere */
     if (doubted || unknown || cycle->unknown || cycle->doubt || begun)
         cycle->shown.duration_s = 0;

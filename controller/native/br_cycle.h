@@ -14,6 +14,7 @@ typedef struct {
     int has_newest, has_other;
     int others;        /* states in a row that belong to the other */
     int ended, silent; /* the run is over; nothing has come for long */
+    double dated_s;    /* the newest one, as it came */
 } br_stream;
 
 br_reception br_stream_accept(br_stream *stream, const br_measured *state, br_counters *counters);
@@ -106,6 +107,7 @@ typedef struct {
     double time_s, trusted_s, x[BR_NX]; /* its time, that of the last state believed, */
     int doubts;                         /* there have been some: */
     double doubted_s, doubt_ended_s;    /* when the last ones began and ended */
+    double ahead_s;                     /* by which times are of another clock than before */
     double gone_m;                      /* and how far it has gone */
 } br_monitor;
 

@@ -57,10 +57,11 @@ br_reception br_stream_accept(br_stream *stream, const br_measured *state, br_co
         return stale ? BR_STATE_STALE : BR_STATE_FOREIGN;
     }
     if (same && (uint64_t)state->seq == (uint64_t)newest->seq + 1)
-        counters->interval_s = fmax(state->time_s - newest->time_s, 0);
+        counters->interval_s = fmax(state->time_s - stream->dated_s, 0);
     else if (!same)
         counters->interval_s = 0;
     stream->newest = *state;
+    stream->dated_s = state->time_s;
     stream->has_newest = 1;
     stream->has_other = stream->others = stream->ended = stream->silent = 0;
     return BR_STATE_NEW;
@@ -84,7 +85,8 @@ int br_stream_forget(br_stream *stream, br_counters *counters) {
  * may change no faster than tyres make them. That is kinematics and holds for any model, sliding or
  * not. A state that contradicts is replaced by the prediction of the corrected model from the last
  * state beyond doubt. States are believed again once several in a row agree with each other and
- * with the prediction. The bounds (BR_MONITOR_...) are the car's, from its file. */
+ * with the prediction. Where their clock has been set meanwhile, they are dated by that of before.
+ * The bounds (BR_MONITOR_...) are the car's, from its file. */
 
 #define AGREEING 3       /* states in a row that end the distrust */
 #define BEYOND_DOUBT 0.1 /* share of the bounds */
@@ -258,6 +260,7 @@ static br_fault examine(br_monitor *monitor, const br_driving *settings, const b
 br_fault br_monitor_check(br_monitor *monitor, const br_driving *settings,
                           const br_controller *controller, double interval_s, br_measured *state) {
     if (settings->sensor_tolerance == 0) return BR_FAULT_NONE;
+    state->time_s -= monitor->ahead_s;
     double dt_s = state->time_s - monitor->measured_s, ways;
     if (!monitor->count || (dt_s > GAP_S && !monitor->distrusted)) {
         begin_anew(monitor, state);
@@ -286,6 +289,11 @@ br_fault br_monitor_check(br_monitor *monitor, const br_driving *settings,
     if (monitor->agreeing >= AGREEING) {
         const int glitch = monitor->time_s - monitor->doubted_s <= RECOVER_S;
         if (glitch && near(monitor, settings, state->x)) {
+            const double ahead_s = state->time_s - monitor->time_s;
+            if (due_s > 0 && fabs(ahead_s) > IN_TIME * due_s) { /* its clock was set */
+                monitor->ahead_s += ahead_s;
+                state->time_s = monitor->time_s;
+            }
             begin_anew(monitor, state);
             monitor->doubt_ended_s = state->time_s;
             return BR_FAULT_NONE;
