@@ -92,41 +92,32 @@ def run_timing(settings: TimingSettings, logs: Sequence[Path], stages: Stages) -
     prepared = prepare(
         settings, settings.driven_on, stages, weights=settings.weights, artefact=settings.artefact
     )
-    found = list[tuple[Case, Floats]]()
     with closing(InstructionCounter()) as counter:
         rig, counted = Rig(settings, prepared, counter), not counter.missing
         with stages.stage("recorded problems"):
             recorded = list(_recorded(rig, runs, settings.problems))
         with stages.stage("search for the worst") as stage:
+            found = list[tuple[Case, Floats]]()
             for one in search(rig, settings.cases, settings.seed, counted):
                 found.append(one)
                 stage.update(len(found) / (2 * settings.cases))
         with stages.stage("adversarial problems"):
             adversarial = [rig.run(case) for case, _ in found]
     found.sort(key=lambda one: -work(one[1], counted))
+    drives = {"recorded": recorded, "adversarial": adversarial}
     everything = np.vstack([*recorded, *adversarial, *(rows for _, rows in found)])
-    bounds = {"iterations": rig.most_iterations, "qp_steps": rig.most_qp_steps}
-    bounds |= {"instructions": 0} if counted else {}
-    hardest = tuple(
-        Hardest(name=name, most=int(everything[:, COLUMNS.index(name)].max()), bound=bound)
-        for name, bound in bounds.items()
-    )
     values = {
         f"{name} {phase}": ms
-        for name, drives in (("recorded", recorded), ("adversarial", adversarial))
-        for phase, ms in _phases(np.vstack(drives)).items()
+        for name, some in drives.items()
+        for phase, ms in _phases(np.vstack(some)).items()
     }
     times = tuple(_times(name, ms, recorded, settings.exceedance) for name, ms in values.items())
     result = TimingResult(
         car=settings.car.name, tracks=tuple(one.track.name for one in rig.tracks),
         rate_hz=settings.rate_hz, limit_ms=settings.limit_ms, horizon=rig.horizon,
-        cycles={"recorded": sum(map(len, recorded)), "adversarial": sum(map(len, adversarial))},
-        times=times, hardest=hardest, counter=counter.missing,
-        worst=tuple(
-            f"{case.kind} on {rig.tracks[case.track].track.name}: "
-            f"{int(rows[:, 4].max())} iterations, {int(rows[:, 5].max())} QP steps"
-            for case, rows in found[:5]
-        ),
+        cycles={name: sum(map(len, some)) for name, some in drives.items()},
+        times=times, hardest=tuple(_hardest(rig, everything, counted)), counter=counter.missing,
+        worst=tuple(_text(rig, case, rows) for case, rows in found[:5]),
         statement=_statement(next(one for one in times if one.name == "recorded answer")),
     )  # fmt: skip
     checks = sorted(_checks(result, len(everything)), key=lambda one: one.subject)
@@ -174,6 +165,19 @@ def _times(name: str, ms: Floats, recorded: Sequence[Floats], exceedance: float)
     fitted = name in ("recorded answer", "recorded fallback")
     tail = fit_tail(_blocks(recorded, name.split()[1]), exceedance) if fitted else None
     return Times(name=name, p50=p50, p99=p99, p999=p999, max=most, tail=tail)
+
+
+def _hardest(rig: Rig, everything: Floats, counted: bool) -> Iterator[Hardest]:
+    bounds = {"iterations": rig.most_iterations, "qp_steps": rig.most_qp_steps}
+    for name, bound in (bounds | ({"instructions": 0} if counted else {})).items():
+        most = int(everything[:, COLUMNS.index(name)].max())
+        yield Hardest(name=name, most=most, bound=bound)
+
+
+def _text(rig: Rig, case: Case, rows: Floats) -> str:
+    iterations, qp_steps = rows[:, 4:6].max(axis=0).astype(int)
+    track = rig.tracks[case.track].track.name
+    return f"{case.kind} on {track}: {iterations} iterations, {qp_steps} QP steps"
 
 
 def _checks(result: TimingResult, feedbacks: int) -> Iterator[Check]:
