@@ -12,7 +12,7 @@ import struct
 import time
 from collections import deque
 from collections.abc import Callable, Collection, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import IO, Any, Final, Generic, NamedTuple, TypeVar, cast
@@ -26,13 +26,11 @@ from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import Writer
 
 from bayesrace.errors import InputError
+from bayesrace.log_clock import CarClock
 from bayesrace.log_parts import PART, part_files, part_path
 from bayesrace.messages import (
     TOPICS,
-    Actuation,
     Message,
-    State,
-    Telemetry,
     Topic,
     decode,
     decode_json,
@@ -52,75 +50,37 @@ _DAMAGED: Final = (
     McapError, struct.error, ValueError, OverflowError, RuntimeError, zstandard.ZstdError
 )  # fmt: skip
 """What unpacking raises at a file that is cut off or spoilt."""
-_LONGEST_GAP_NS: Final = 10_000_000_000
-"""Between two states of a run; a longer one is no driving."""
 _MCAP_MAGIC: Final = b"\x89MCAP0\r\n"
-
-
-class _CarClock:
-    """Car time on one line through all runs of a log, from the calendar time of its first message.
-
-    A run begins where the one before has ended, in real time at its own calendar time.
-    """
-
-    def __init__(self) -> None:
-        self._run: tuple[int, int] | None = None
-        self._begin_ns = self._newest_ns = 0
-        self._decided_ns: dict[str, int] = {}
-
-    def time_ns(self, message: Message | None, wall_ns: int, sender: str) -> int:
-        """Of a state its own time, of actuation and telemetry that of the decision; of all else the
-        newest state's. ``wall_ns``: calendar time of its arrival; ``sender``: what the keys of a
-        controller, or of a shadow, have in common."""
-        self._newest_ns = self._newest_ns or wall_ns
-        if isinstance(message, Telemetry):  # follows its actuation, from the same process
-            return self._decided_ns.get(sender, self._newest_ns)
-        if not isinstance(message, State | Actuation):
-            return self._newest_ns
-        run = message.epoch, message.run
-        own_s = message.time_s if isinstance(message, State) else message.decided_at_s
-        own_ns = round(1e9 * own_s)
-        time_ns = self._begin_ns + own_ns
-        goes_on = run == self._run and abs(time_ns - self._newest_ns) <= _LONGEST_GAP_NS
-        if isinstance(message, Actuation):  # it can overtake the first state of a run
-            self._decided_ns[sender] = time_ns if goes_on else self._newest_ns
-            return self._decided_ns[sender]
-        if not goes_on:
-            time_ns = self._newest_ns if message.lockstep else max(self._newest_ns, wall_ns)
-            self._run, self._begin_ns = run, time_ns - own_ns
-        self._newest_ns = max(self._newest_ns, time_ns)
-        return time_ns
 
 
 class LogWriter:
     """Appends messages and metadata to an MCAP file. One thread only.
 
-    ``log_time`` is car time (:class:`_CarClock`), ``publish_time`` calendar time of the arrival.
+    ``log_time`` is car time (:class:`.CarClock`), ``publish_time`` calendar time of the arrival.
     What is not a message of its key's topic stays as it was received, on a channel with the message
     encoding ``msgpack`` and no schema.
     """
 
-    def __init__(
-        self,
-        path: Path,
-        metadata: Mapping[str, Mapping[str, str]] | None = None,
-        clock: _CarClock | None = None,
-    ) -> None:
-        """``clock``: that of the log which this one continues."""
-        self.path = path
+    def __init__(self, path: Path, metadata: Mapping[str, Mapping[str, str]] | None = None) -> None:
+        """InputError if the file cannot be written."""
+        # MCAP tools show calendar time; intervals stay those of the monotonic clock.
+        self._epoch_ns = time.time_ns() - time.monotonic_ns()
+        self._clock = CarClock()
+        self._begin(path, metadata or {})
+
+    def _begin(self, path: Path, metadata: Mapping[str, Mapping[str, str]]) -> None:
+        """A file, in which car time goes on."""
         try:
             self._file = path.open("wb")
         except OSError as error:
             raise InputError(f"cannot write the log {path}: {error.strerror}") from None
+        self.path = path
         self._writer = Writer(self._file)
         self._writer.start(library="bayesrace")
         self._channels: dict[tuple[str, bool], int] = {}
         self._schemas: dict[str, int] = {}
-        # MCAP tools show calendar time; intervals stay those of the monotonic clock.
-        self._epoch_ns = time.time_ns() - time.monotonic_ns()
-        self.clock = clock or _CarClock()
-        for name, values in (metadata or {}).items():
-            self.add_metadata(name, values)
+        for name, values in metadata.items():
+            self._writer.add_metadata(name, dict(values))
         self.flush()
 
     @property
@@ -146,7 +106,7 @@ class LogWriter:
             schema = 0 if message is None else self._schema(type(message))
             self._channels[place] = self._writer.register_channel(key, encoding, schema)
         wall_ns = self._epoch_ns + received_ns
-        time_ns = self.clock.time_ns(message, wall_ns, key.rpartition("/")[0])
+        time_ns = self._clock.time_ns(message, wall_ns, key.rpartition("/")[0])
         seq = None if message is None else message.seq
         content = data if message is None else to_json(message)
         number = 0 if seq is None else seq & 0xFFFFFFFF
@@ -240,25 +200,22 @@ class LogReader:
         self._first = next(iter(parts))
         self.part = self._about(self._first)
         """Which recording it is a part of, as the file says where reading begins; else empty."""
-        self._place = self._begin()
+        self._place = _Place(self._first)
 
     @property
     def parts_gone(self) -> int:
         """Parts of the recording before the first message that is read."""
         return _count(self.part.get("number", ""))
 
-    def _begin(self) -> _Place:
-        return _Place(self._first)
-
     def metadata(self) -> dict[str, dict[str, str]]:
         """Name to map of texts; the last of one name wins."""
-        everything = self._records(self._begin())
+        everything = self._records(_Place(self._first))
         found = (record for record in everything if isinstance(record, Metadata))
         return {record.name: dict(record.metadata) for record in found}
 
     def channels(self) -> set[str]:
         """The keys that it holds messages of."""
-        everything = self._records(self._begin())
+        everything = self._records(_Place(self._first))
         return {record.topic for record in everything if isinstance(record, Channel)}
 
     def messages(self, topics: Collection[Topic[Any]] = TOPICS) -> Iterator[Entry[Any]]:
@@ -266,7 +223,7 @@ class LogReader:
 
         They are read from the beginning, whatever :meth:`newer` has returned.
         """
-        return self._entries(self._begin(), topics)
+        return self._entries(_Place(self._first), topics)
 
     def newer(self, topics: Collection[Topic[Any]] = TOPICS) -> Iterator[Entry[Any]]:
         """The messages of these topics in what has been added to the log since the last call.
@@ -350,9 +307,11 @@ class LogReader:
             yield place.pending.popleft()
         if place.ended:
             return
-        with _opened(path) as file:
-            if file is None:
-                return
+        try:
+            file = path.open("rb")
+        except FileNotFoundError:
+            return
+        with file:
             head = file.read(len(_MCAP_MAGIC))
             if not _MCAP_MAGIC.startswith(head):
                 raise InputError(f"{path} is not an MCAP log; give the log of a run")
@@ -387,18 +346,6 @@ class LogReader:
         records: list[Any] = breakup_chunk(_unpacked(record), validate_crc=True)
         place.unpacked = total
         return records
-
-
-@contextmanager
-def _opened(path: Path) -> Iterator[IO[bytes] | None]:
-    """A part for reading; None if it has been deleted."""
-    try:
-        file = path.open("rb")
-    except FileNotFoundError:
-        yield None
-        return
-    with file:
-        yield file
 
 
 def _count(text: str) -> int:

@@ -22,8 +22,8 @@ _REPEATED: Final = ("weights_accepted", "run")
 """Kinds of events that say what is driven: each part begins with the newest."""
 
 
-class RotatingLog:
-    """A :class:`.LogWriter` of as many bytes as wanted, in parts (:mod:`bayesrace.log_parts`).
+class RotatingLog(LogWriter):
+    """A log of as many bytes as wanted, in parts (:mod:`bayesrace.log_parts`).
 
     Each part has all metadata, and the newest announcements of weights and run: it can be read
     alone. Those of a recording that was there before under the same name are deleted. One thread
@@ -45,38 +45,25 @@ class RotatingLog:
                 raise InputError(f"{file} is no part of {path} and would be replaced; move it away")
         self.deleted = 0
         """Parts that are deleted."""
-        self._name, self._metadata, self._most = path, dict(metadata or {}), most_bytes
+        self._first, self._metadata, self._most = path, dict(metadata or {}), most_bytes
         self._recording, self._number = secrets.token_hex(8), 0
         self._closed: deque[tuple[Path, int]] = deque()
         self._announced: dict[tuple[str, str], tuple[bytes, int]] = {}
-        self._writer = LogWriter(path, self._described())
-
-    @property
-    def path(self) -> Path:
-        """Of the part that is written."""
-        return self._writer.path
+        super().__init__(path, self._described())
 
     def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
-        """See :meth:`.LogWriter.add_metadata`; later parts have them, too."""
+        """Later parts have them, too."""
         self._metadata[name] = values
-        self._writer.add_metadata(name, values)
+        super().add_metadata(name, values)
 
     def write(self, key: str, data: bytes, received_ns: int) -> int | None:
-        """See :meth:`.LogWriter.write`."""
-        seq = self._writer.write(key, data, received_ns)
+        """The part may be full with it, and the next one begin."""
+        seq = super().write(key, data, received_ns)
         if self._most is not None:
             self._note(key, data, received_ns)
-            if self._writer.size_bytes >= self._most // _PARTS:
+            if self.size_bytes >= self._most // _PARTS:
                 self._rotate(self._most)
         return seq
-
-    def flush(self) -> None:
-        """See :meth:`.LogWriter.flush`."""
-        self._writer.flush()
-
-    def close(self) -> None:
-        """See :meth:`.LogWriter.close`."""
-        self._writer.close()
 
     def _described(self) -> dict[str, Mapping[str, str]]:
         """The metadata at the beginning of a part."""
@@ -97,15 +84,14 @@ class RotatingLog:
                     self._announced[key, kind] = data, received_ns
 
     def _rotate(self, most_bytes: int) -> None:
-        self._writer.close()
+        self.close()
         self._closed.append((self.path, self.path.stat().st_size))
         while sum(size for _, size in self._closed) + 2 * (most_bytes // _PARTS) > most_bytes:
             oldest, _ = self._closed.popleft()
             oldest.unlink(missing_ok=True)
             self.deleted += 1
         self._number += 1
-        path = part_path(self._name, self._number)
-        self._writer = LogWriter(path, self._described(), self._writer.clock)
+        self._begin(part_path(self._first, self._number), self._described())
         for (key, _), (data, received_ns) in self._announced.items():
-            self._writer.write(key, data, received_ns)
-        self._writer.flush()
+            super().write(key, data, received_ns)
+        self.flush()

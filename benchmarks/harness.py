@@ -83,6 +83,17 @@ def ratio(values: ArrayLike, base: ArrayLike) -> Row:
     return {"ratio": float(middle), "least": float(low), "largest": float(high)}
 
 
+def processor() -> str:
+    """Its name, as the machine gives it."""
+    return cpu_identity().splitlines()[0].rpartition(":")[2].strip()
+
+
+def resident_bytes(pid: int | str) -> int:
+    """Resident memory of a process."""
+    status = Path(f"/proc/{pid}/status").read_text()
+    return 1024 * int(status.partition("VmRSS:")[2].split()[0])
+
+
 def report(given: Namespace, title: str, rows: Sequence[Row], exact: ArrayLike = ()) -> None:
     """Prints the rows as a table, and writes the JSON file if it is wanted.
 
@@ -96,10 +107,9 @@ def report(given: Namespace, title: str, rows: Sequence[Row], exact: ArrayLike =
     if given.json:
         git = ["git", "-C", str(ROOT), "describe", "--always", "--dirty"]
         commit = subprocess.run(git, capture_output=True, text=True, check=False).stdout.strip()
-        processor = cpu_identity().splitlines()[0].rpartition(":")[2].strip()
         content = {
             "title": title, "options": vars(given), "utc": f"{datetime.now(UTC):%F %T}",
-            "commit": commit, "processor": processor, "processors": os.cpu_count(),
+            "commit": commit, "processor": processor(), "processors": os.cpu_count(),
             "system": platform.platform(),
             "rows": list(rows), "exact": np.ravel(exact).tolist(),
         }  # fmt: skip

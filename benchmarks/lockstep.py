@@ -24,7 +24,16 @@ from bayesrace.operation.system import started_system
 from bayesrace.recorder import Recorder
 from bayesrace.tracks import DEFAULT_RACE_TRACK
 from bayesrace.vehicles import default_car
-from benchmarks.harness import Row, arguments, controller, in_turn, prepared, ratio, report
+from benchmarks.harness import (
+    Row,
+    arguments,
+    controller,
+    in_turn,
+    prepared,
+    ratio,
+    report,
+    resident_bytes,
+)
 
 
 def main() -> None:
@@ -58,8 +67,7 @@ def main() -> None:
             for end, record in ((", recorded", True), ("", False))
         }
         factors = in_turn(ways, given.rounds)
-        status = Path(f"/proc/{system.children['controller'].pid}/status").read_text()
-        memory_mb = int(status.partition("VmRSS:")[2].split()[0]) / 1024
+        memory_mb = resident_bytes(system.children["controller"].pid) / 2**20
         states = [np.array([truth.x for truth in LogReader(log).select(TRUTH)]) for log in logs]
     assert np.array_equal(states[0], states[1]), "other states"
     base, rows = factors["over Zenoh, recorded"], list[Row]()

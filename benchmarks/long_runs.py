@@ -33,7 +33,7 @@ from bayesrace.recorder import Recorder
 from bayesrace.studies.evidence.verdict import Check, Verdict
 from bayesrace.tracks import DEFAULT_RACE_TRACK, Track
 from bayesrace.vehicles import default_car
-from benchmarks.harness import Row, arguments, prepared, report
+from benchmarks.harness import Row, arguments, prepared, report, resident_bytes
 
 MB: Final = 1e6
 GROWTH_MB: Final = 5.0
@@ -54,26 +54,13 @@ DRIVEN: Final = {
 TIMING: Final = {
     "plant": ("late", "stale", "overruns", "planned", "braked", "actuations_lost"),
     "controller": (
-        "skipped",
-        "deadline_misses",
-        "overruns",
-        "late_states",
-        "states_lost",
-        "states_stale",
-        "shifted_plan",
-        "brake",
-        "stop",
+        "skipped", "deadline_misses", "overruns", "late_states", "states_lost", "states_stale",
+        "shifted_plan", "brake", "stop",
     ),
-}
+}  # fmt: skip
 """Those that a machine with other work counts up in real time; in lockstep they are 0."""
 TIMED_SHARE: Final = 1e-3
 """Of the cycles, in real time."""
-
-
-def resident_bytes(pid: int | str) -> int:
-    """Resident memory of a process."""
-    status = Path(f"/proc/{pid}/status").read_text()
-    return 1024 * int(status.partition("VmRSS:")[2].split()[0])
 
 
 @contextmanager

@@ -1,4 +1,4 @@
-"""The numbers of README and docs: each stands in docs/numbers.json, which a command writes.
+"""The numbers of README and docs: each stands in docs/numbers.json, with the command behind it.
 
     python -m benchmarks.numbers measure [NAME ...]   runs the commands; writes docs/numbers.json
     python -m benchmarks.numbers fill                 writes the numbers into README.md and docs/
@@ -17,6 +17,7 @@ where page and file differ or a name is unknown; what is older it prints.
 
 import argparse
 import json
+import os
 import platform
 import re
 import shlex
@@ -28,15 +29,14 @@ from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from shutil import rmtree
+from typing import Any, Final
 
-ROOT: Final = Path(__file__).parents[1]
+from benchmarks.harness import ROOT, processor
+
 FILE: Final = ROOT / "docs" / "numbers.json"
 _RAW: Final = ROOT / "build" / "numbers"
 """What the commands have written, in full."""
-
-_STEP: Final = ("bayesrace", "codegen", "controller/native", "controller/settings.py")
-_RACE: Final = (*_STEP, "controller", "learning", "plant", "operation/race.py")
 
 _MARKED: Final = re.compile(
     r"(?P<number>[-−+]?\d[\d ]*(?:\.\d+)?(?:e-?\d+)?)"
@@ -46,52 +46,20 @@ _MARKED: Final = re.compile(
 _IN_TEXT: Final = re.compile(r"(?<![\w.])-?\d+(?:\.\d+)?(?:e-?\d+)?(?![\w.])")
 
 
-class Measurement(NamedTuple):
-    """A command, the JSON file that it leaves in ``{out}``, and what its numbers depend on."""
+@dataclass
+class Measurement:
+    """A command with what it has measured; an entry of docs/numbers.json."""
 
     command: str
+    """``{out}``: a folder of its own; ``{tracks}`` and ``{data}``: the paper's own files."""
     file: str
-    depends: tuple[str, ...]
-
-
-MEASUREMENTS: Final = {
-    "race": Measurement("bayesrace race --out {out}", "result.json", _RACE),
-    "f1tenth": Measurement("bayesrace race --car f1tenth --out {out}", "result.json", _RACE),
-    "ethz": Measurement(
-        "bayesrace race --track {tracks}/ethz.csv --train-track {tracks}/ethzmobil.csv --out {out}",
-        "result.json", _RACE,
-    ),
-    "ethzmobil": Measurement(
-        "bayesrace race --track {tracks}/ethzmobil.csv --train-track {tracks}/ethz.csv --out {out}",
-        "result.json", _RACE,
-    ),
-    "bench": Measurement("bayesrace bench --json {out}/bench.json", "bench.json", _STEP),
-    "latency50": Measurement(
-        "bayesrace latency --rate 50 --json {out}/latency.json", "latency.json",
-        (*_STEP, "controller", "plant"),
-    ),
-    "latency500": Measurement(
-        "bayesrace latency --rate 500 --json {out}/latency.json", "latency.json",
-        (*_STEP, "controller", "plant"),
-    ),
-    "timing": Measurement("bayesrace timing --at-most 1000 --out {out}", "timing.json", _STEP),
-    "timing40": Measurement(
-        "bayesrace timing --horizon 40 --at-most 1000 --out {out}", "timing.json", _STEP
-    ),
-    "interface": Measurement(
-        "python -m benchmarks.interface --json {out}/interface.json", "interface.json",
-        (*_STEP, "controller", "plant", "operation/closed_loop.py", "benchmarks/interface.py"),
-    ),
-    "long_runs": Measurement(
-        "python -m benchmarks.long_runs --out {out} --json {out}/long.json", "long.json",
-        (*_STEP, "controller", "plant", "operation/drive.py", "benchmarks/long_runs.py"),
-    ),
-    "paper": Measurement(
-        "bayesrace paper --tracks {tracks} --data {data} --out {out}", "numbers.json",
-        (*_RACE, "studies/paper"),
-    ),
-}  # fmt: skip
-"""``{tracks}`` and ``{data}``: the paper's own files, by --tracks and --data."""
+    """JSON that it leaves there."""
+    depends: list[str]
+    """Files and folders of which the numbers are."""
+    commit: str = ""
+    date: str = ""
+    machine: str = ""
+    numbers: dict[str, float] = field(default_factory=dict)
 
 
 def facts() -> dict[str, Any]:
@@ -105,18 +73,6 @@ def facts() -> dict[str, Any]:
         "spoilt_weights": len(SPOILT),
         "sensor_faults": len(FAULTS),
     }
-
-
-@dataclass
-class Measured:
-    """One measurement in docs/numbers.json."""
-
-    command: str
-    commit: str
-    date: str
-    machine: str
-    depends: list[str]
-    numbers: dict[str, float] = field(default_factory=dict)
 
 
 def flat(value: Any, path: str = "") -> Iterator[tuple[str, float]]:
@@ -169,11 +125,9 @@ def wanted() -> dict[str, set[str]]:
     return names
 
 
-def read() -> dict[str, Measured]:
+def read() -> dict[str, Measurement]:
     """docs/numbers.json."""
-    if not FILE.is_file():
-        return {}
-    return {name: Measured(**content) for name, content in json.loads(FILE.read_text()).items()}
+    return {name: Measurement(**content) for name, content in json.loads(FILE.read_text()).items()}
 
 
 def known() -> Callable[[str], float]:
@@ -192,50 +146,31 @@ def _git(*words: str) -> str:
     return done.stdout.strip()
 
 
-def _machine() -> str:
-    """Processor, number of CPUs, kernel."""
-    info = Path("/proc/cpuinfo")
-    lines = info.read_text().splitlines() if info.is_file() else []
-    model = next((line.split(":")[1].strip() for line in lines if "model name" in line), "")
-    count = sum("processor" in line for line in lines)
-    return f"{model or platform.machine()}, {count} CPUs, Linux {platform.release()}"
-
-
 def measure(names: list[str], given: dict[str, str]) -> None:
     """Runs the commands and writes their numbers, those that the pages use."""
     if _git("status", "--porcelain", "--untracked-files=no"):
         sys.exit("numbers: commit first, so that the numbers have a commit")
-    for name in names or list(MEASUREMENTS):
-        one, out = MEASUREMENTS[name], _RAW / name
+    everything = read()
+    for name in names or list(everything):
+        one, out = everything[name], _RAW / name
         if any(f"{{{key}}}" in one.command and not value for key, value in given.items()):
             print(f"{name}: left out, it needs --tracks and --data")
             continue
-        subprocess.run(["rm", "-rf", str(out)], check=True)
+        rmtree(out, ignore_errors=True)
         out.mkdir(parents=True)
         words = [part.format(out=out, **given) for part in shlex.split(one.command)]
         print(f"{name}: {shlex.join(words)}", flush=True)
         subprocess.run([Path(sys.executable).parent / words[0], *words[1:]], check=True)
-        content = Measured(
-            command=one.command.replace(" --out {out}", "").replace("{out}/", ""),
-            commit=_git("rev-parse", "--short", "HEAD"),
-            date=datetime.now(UTC).date().isoformat(),
-            machine=_machine(),
-            depends=list(one.depends),
-        )
-        take(name, content)
-
-
-def take(name: str, content: Measured) -> None:
-    """Writes those numbers of a measurement that the pages use."""
-    raw = json.loads((_RAW / name / MEASUREMENTS[name].file).read_text())
-    found = dict(flat(raw))
-    paths = sorted(wanted().get(name, set()))
-    content.numbers = {path: found[path] for path in paths if path in found}
-    for path in set(paths) - set(found):
-        print(f"{name}: its command writes no '{path}'")
-    everything = read() | {name: content}
-    text = {key: asdict(one) for key, one in sorted(everything.items())}
-    FILE.write_text(json.dumps(text, indent=1) + "\n")
+        found = dict(flat(json.loads((out / one.file).read_text())))
+        paths = sorted(wanted().get(name, set()))
+        for path in set(paths) - set(found):
+            print(f"{name}: its command writes no '{path}'")
+        one.numbers = {path: found[path] for path in paths if path in found}
+        one.commit = _git("rev-parse", "--short", "HEAD")
+        one.date = datetime.now(UTC).date().isoformat()
+        one.machine = f"{processor()}, {os.cpu_count()} CPUs, Linux {platform.release()}"
+        text = {key: asdict(each) for key, each in sorted(everything.items())}
+        FILE.write_text(json.dumps(text, indent=1) + "\n")
 
 
 def _shown(value: float, like: str) -> str:

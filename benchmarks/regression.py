@@ -12,7 +12,6 @@ first inputs and driven states differ; ``--same`` fails if they do.
 
 import json
 import os
-import re
 import shlex
 import subprocess
 import sys
@@ -20,6 +19,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
+from shutil import copytree
 from tempfile import TemporaryDirectory
 
 import numpy as np
@@ -39,17 +39,6 @@ def checked_out(name: str) -> Iterator[Path]:
     with TemporaryDirectory() as folder:
         subprocess.run(["tar", "-xC", folder], input=archive.stdout, check=True)
         yield Path(folder)
-
-
-def put_benchmarks(version: Path, folder: Path) -> None:
-    """Copies the benchmarks of this checkout, with the imports that this version has: in some
-    versions the parts of the project are packages within ``bayesrace``."""
-    within = "bayesrace." if (version / "bayesrace" / "operation").exists() else ""
-    parts = r"(from |\")(?:bayesrace\.)?(codegen|controller|learning|operation|plant|studies)\."
-    (folder / "benchmarks").mkdir()
-    for file in Path(__file__).parent.glob("*.py"):
-        text = re.sub(parts, rf"\1{within}\2.", file.read_text())
-        (folder / "benchmarks" / file.name).write_text(text)
 
 
 def measure(benchmark: str, options: list[str], version: Path, folder: Path) -> Row:
@@ -84,7 +73,7 @@ def main() -> None:
         for name in "ab":
             folder = Path(stack.enter_context(TemporaryDirectory()))
             versions[name] = stack.enter_context(checked_out(getattr(given, name))), folder
-            put_benchmarks(*versions[name])
+            copytree(Path(__file__).parent, folder / "benchmarks")
         for one, *options in map(shlex.split, given.of):
             if one == "step":
                 options += ["--file", str(versions["a"][1] / "problems.npz")]

@@ -22,10 +22,10 @@ from bayesrace.controller.assembly import PathTable, make_path_table
 from bayesrace.controller.native_step import NativeStep
 from bayesrace.controller.settings import MpcSettings
 from bayesrace.gp.weights import read_weights
-from bayesrace.plant.simulator import PLANT, Simulator
+from bayesrace.operation.closed_loop import ClosedLoop
+from bayesrace.plant.simulator import PLANT
 from bayesrace.tracks import DEFAULT_RACE_TRACK
 from bayesrace.vehicles import default_car
-from bayesrace.vehicles.models import dynamic
 from benchmarks.harness import Row, arguments, controller, percentiles, prepared, report
 
 _TRACKS = (DEFAULT_RACE_TRACK, "random:11", "random:15")
@@ -34,35 +34,31 @@ _BUDGETS_S = {"": None, " in lockstep": 0.0, " in real time": 0.016}  # of the p
 
 def record(count: int) -> Row:
     """What each step of three drives had to solve."""
-    car, made = default_car(), prepared(*_TRACKS)
-    data: Row = {"x": [], "d": [], "track": [], "weights": str(made.weights)}
+    car, made, data = default_car(), prepared(*_TRACKS), Row()
     for number, on in enumerate(made.tracks):
+        loop = ClosedLoop(car, on.track, on.line, controller(made, number))
+        driven_s = count // len(_TRACKS) * PLANT.step_s
+        states = loop.drive(0, driven_s, start_speed_mps=1.0).states[:-1]
         path = make_path_table(on.track, on.line, car.tuning.path.spacing_m)
+        data[f"x{number}"] = [one.x for one in states]
+        data[f"d{number}"] = [one.u_applied[0] for one in states]
         data |= {f"path{number}": path.rows, "spacing_m": path.spacing_m}
-        step, simulator = controller(made, number).native, Simulator(dynamic(car))
-        simulator.reset([*on.track.start_pose(), 1.0, 0.0, 0.0, 0.0])
-        for k in range(count // len(_TRACKS)):
-            x, d = simulator.x.copy(), simulator.u_applied[0]
-            usable = step.step(x, d).usable
-            for name, value in (("x", x), ("d", d), ("track", -1 if k else number)):
-                data[name].append(value)
-            simulator.step(step.u.tolist() if usable else None)
-    return data
+    return data | {"weights": str(made.weights)}
 
 
 def solve(step: NativeStep, data: Any, budget_s: float | None) -> Floats:
     """Times of step and preparation [us] and the first input of each problem, (n, 4)."""
     now, rows = time.thread_time_ns, []
-    for x, d, track in zip(data["x"], data["d"], data["track"], strict=True):
-        if track >= 0:
-            step.set_path(PathTable(data[f"path{track}"], float(data["spacing_m"])))
-            step.reset()
-        begin = now()
-        if budget_s is not None:
-            step.prepare(PLANT.step_s, budget_s)
-        middle = now()
-        step.step(x, float(d))
-        rows.append((1e-3 * (now() - middle), 1e-3 * (middle - begin), *step.u))
+    for number in range(len(_TRACKS)):
+        step.set_path(PathTable(data[f"path{number}"], float(data["spacing_m"])))
+        step.reset()
+        for x, d in zip(data[f"x{number}"], data[f"d{number}"].tolist(), strict=True):
+            begin = now()
+            if budget_s is not None:
+                step.prepare(PLANT.step_s, budget_s)
+            middle = now()
+            step.step(x, d)
+            rows.append((1e-3 * (now() - middle), 1e-3 * (middle - begin), *step.u))
     return np.array(rows)
 
 
@@ -86,7 +82,7 @@ def main() -> None:
         named = {"feedback": step_us, "preparation": prepare_us} if how else {"whole step": step_us}
         rows += [{"us": name + how, **percentiles(us)} for name, us in named.items()]
     assert np.array_equal(inputs[""], inputs[" in lockstep"]), "a preparation has changed a step"
-    report(given, f"{len(data['d'])} steps, caution {given.caution:g}", rows, inputs[""])
+    report(given, f"{passes.shape[1]} steps, caution {given.caution:g}", rows, inputs[""])
 
 
 if __name__ == "__main__":

@@ -202,6 +202,11 @@ class Driver:
         return list(self._instruments)[number] if number >= 0 else ""
 
     @property
+    def info(self) -> Any:
+        """Of the compiled controller's newest step: a br_mpc_info."""
+        return self._library.br_cycle_info(self._cycle)
+
+    @property
     def output(self) -> StepOutput | None:
         """Of the newest cycle's step; None if it made none. The next cycle overwrites it."""
         return self.controller.result(self._cycle) if self.decision.stepped else None

@@ -7,7 +7,7 @@ nor waiting count.
 """
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -15,9 +15,10 @@ import numpy as np
 from msgspec import structs
 
 from bayesrace.arrays import Floats
-from bayesrace.controller.assembly import PredictiveController, compiled_controller
+from bayesrace.controller.assembly import compiled_controller
 from bayesrace.controller.cycle import Cycle
-from bayesrace.controller.process_settings import ControllerSettings
+from bayesrace.controller.native_step import Artefact
+from bayesrace.controller.settings import CycleSettings, MpcSettings
 from bayesrace.gp.weights import Weights, read_weights
 from bayesrace.messages import State
 from bayesrace.operation.closed_loop import built_in_car
@@ -39,6 +40,9 @@ COLUMNS: Final = (
 
 _CYCLES: Final = 10
 """Of an adversarial case, from its start on."""
+
+_TOO_LATE_S: Final = 2 * max(CycleSettings().stale_s, PLANT.step_s)
+"""No step is made by a state of that age."""
 
 _Range = tuple[Sequence[float], Sequence[float]]
 KINDS: Final[dict[str, _Range]] = {
@@ -81,101 +85,83 @@ class Rig:
     def __init__(
         self, settings: TimingSettings, prepared: Prepared, counter: InstructionCounter
     ) -> None:
-        self._settings, self._prepared, self._counter = settings, prepared, counter
+        self._settings, self._files, self._counter = settings, prepared, counter
+        self.tracks: tuple[PreparedTrack, ...] = prepared.tracks
         self._car, self._vehicle = settings.driven_car, built_in_car(settings.driven_car)
         self._weights, self._run = read_weights(prepared.weights), 0
-        self._made: dict[tuple[int, bool], tuple[Cycle, Cycle, PredictiveController]] = {}
-        self.tracks: tuple[PreparedTrack, ...] = prepared.tracks
-        self.most_qp_steps, self.most_iterations = self._bounds()
-        *_, controller = self._controllers(0, rough=False)
-        self.horizon = controller.native.manifest.horizon
-
-    def _bounds(self) -> tuple[int, int]:
-        """Of a feedback by construction: steps of its QPs, and SQP iterations (br_step.c)."""
-        *_, controller = self._controllers(0, rough=False)
-        library, mpc = controller.artefact.library, controller.native._parameters
+        self._made: dict[tuple[int, bool], tuple[Cycle, Cycle]] = {}
+        artefact, mpc = Artefact(prepared.artefacts[0]), MpcSettings()
+        library, self._capacity = artefact.library, artefact.manifest.gp_capacity
+        self.horizon = artefact.manifest.horizon
         starts = (library.BR_COLD_GUESSES + 1) * library.BR_SECOND_START_ITERATIONS
-        return mpc.qp_steps, max(mpc.iterations, mpc.iterations_cold) + starts
+        self.most_qp_steps = mpc.qp_steps
+        self.most_iterations = max(mpc.iterations, mpc.iterations_cold) + starts
+        """Of a feedback, by construction: br_step.c."""
 
-    def _controllers(self, track: int, rough: bool) -> tuple[Cycle, Cycle, PredictiveController]:
-        if (found := self._made.get((track, rough))) is None:
-            one, artefact = self.tracks[track], self._prepared.artefacts[0]
-            weights = self._weights
-            makes = [
-                compiled_controller(artefact, self._car, one.track, one.line, weights)
-                for _ in range(2)
-            ]
-            if rough:
-                capacity = makes[0].native.manifest.gp_capacity
-                for each in makes:
-                    each.native.set_weights(_roughened(weights, capacity, self._settings.seed))
-            settings = ControllerSettings(car=self._car)
-            cycle, blind = (Cycle(each, self._car, settings) for each in makes)
-            found = self._made[track, rough] = cycle, blind, makes[0]
-        return found
-
-    def _answered(self, state: State, track: int, rough: bool, budget: float) -> list[float]:
+    def _answered(self, cycles: tuple[Cycle, Cycle], state: State, budget_s: float) -> list[float]:
         """Of a cycle by this state: what :data:`COLUMNS` says."""
-        cycle, blind, controller = self._controllers(track, rough)
-        period_s, now, read = self._settings.period_s, time.thread_time_ns, self._counter.read
-        times = [now()]
-        cycle.driver.observe(state)
-        times.append(now())
-        count = read()
-        decision = cycle.decide(state.time_s, budget * period_s)
-        count = read() - count
-        times.append(now())
-        info = controller.artefact.library.br_cycle_info(cycle.driver._cycle)
-        counts = (info.iterations, info.qp_iterations) if decision.stepped else (0, 0)
-        begin = now()
-        cycle.prepare(PLANT.step_s, budget * period_s)
-        prepared = now() - begin
+        (cycle, blind), count = cycles, self._counter.read
+        estimate = _timed(lambda: cycle.driver.observe(state))
+        begin = count()
+        feedback = _timed(lambda: cycle.decide(state.time_s, budget_s))
+        instructions, info = count() - begin, cycle.driver.info
+        counts = (info.iterations, info.qp_iterations) if cycle.driver.decision.stepped else (0, 0)
+        prepare = _timed(lambda: cycle.prepare(PLANT.step_s, budget_s))
         blind.driver.observe(state)
-        late_s = 2 * max(ControllerSettings(car=self._car).stale_s, PLANT.step_s)
-        begin = now()
-        blind.decide(state.time_s + late_s)
-        spent = [*np.diff(times), prepared, now() - begin]
-        return [*(1e-6 * float(ns) for ns in spent), *counts, count]
+        fallback = _timed(lambda: blind.decide(state.time_s + _TOO_LATE_S))
+        return [estimate, feedback, prepare, fallback, *counts, instructions]
 
-    def _begin(self, track: int, rough: bool) -> Cycle:
-        """Another run: its first state counts. The cycle that will answer."""
+    def _begin(self, track: int, rough: bool = False) -> tuple[Cycle, Cycle]:
+        """One that drives, and one for the fallback, for another run: its first state counts."""
         self._run += 1
-        cycle, blind, _ = self._controllers(track, rough)
-        for one in (cycle, blind):
-            one.driver.lost(silent=False)
-        return cycle
+        if (track, rough) not in self._made:
+            one, weights = self.tracks[track], self._weights
+            if rough:
+                weights = _roughened(weights, self._capacity, self._settings.seed)
+            files = self._files.artefacts[0], self._car, one.track, one.line, weights
+            cycle, blind = (
+                Cycle(compiled_controller(*files), self._car, CycleSettings()) for _ in range(2)
+            )
+            self._made[track, rough] = cycle, blind
+        for each in self._made[track, rough]:
+            each.driver.lost(silent=False)
+        return self._made[track, rough]
 
-    def replay(self, states: Sequence[State], track: int = 0) -> Floats:
-        """Cycles (n, 7) by the states of one run, whatever the answers are."""
-        self._begin(track, rough=False)
+    def replay(self, states: Sequence[State]) -> Floats:
+        """Cycles (n, 7) by the states of one run on the first track, whatever the answers are."""
+        cycles = self._begin(0)
         again = (structs.replace(one, run=self._run) for one in states if not one.final)
         with uncollected():
-            budget = self._settings.budget
-            return np.array([self._answered(one, track, False, budget) for one in again])
+            return np.array([self._answered(cycles, one, self._budget_s) for one in again])
 
-    def drive(self, track: int, cycles: int) -> Floats:
+    def drive(self, track: int, count: int) -> Floats:
         """Cycles (n, 7) of a drive from the start line."""
-        return self._driven(track, cycles, None, False, self._settings.budget)
+        return self._driven(self._begin(track), track, count, self._budget_s)
 
-    def run(self, case: Case, budget: float | None = None) -> Floats:
-        """Cycles (n, 7) from the case's start; with the budget of the settings, or this one."""
-        given = self._settings.budget if budget is None else budget
-        return self._driven(case.track, _CYCLES, self._start(case), case.kind == "weights", given)
+    def run(self, case: Case, budget_s: float | None = None) -> Floats:
+        """Cycles (n, 7) from the case's start, with that budget; None: that of the settings."""
+        cycles = self._begin(case.track, case.kind == "weights")
+        budget_s = self._budget_s if budget_s is None else budget_s
+        return self._driven(cycles, case.track, _CYCLES, budget_s, self._start(case))
+
+    @property
+    def _budget_s(self) -> float:
+        return self._settings.budget * self._settings.period_s
 
     def _driven(
-        self, track: int, cycles: int, x0: Sequence[float] | None, rough: bool, budget: float
-    ) -> Floats:
-        cycle, rows = self._begin(track, rough), list[list[float]]()
+        self, cycles: tuple[Cycle, Cycle], track: int, count: int, budget_s: float,
+        x0: Sequence[float] = (),
+    ) -> Floats:  # fmt: skip
+        rows, decision = list[list[float]](), cycles[0].driver.decision
 
         def exchange(state: State, _: tuple[float, ...]) -> tuple[float, float]:
             if not state.final:
-                rows.append(self._answered(state, track, rough, budget))
-            return cycle.driver.decision.d, cycle.driver.decision.delta_rate
+                rows.append(self._answered(cycles, state, budget_s))
+            return decision.d, decision.delta_rate
 
-        plan = RunPlan(self._run, "", 0, cycles * PLANT.step_s, lockstep=True)
+        plan = RunPlan(self._run, "", 0, count * PLANT.step_s, lockstep=True)
         request = run_request(self.tracks[track].track, plan)
-        if x0 is not None:
-            request = structs.replace(request, x0=tuple(x0))
+        request = structs.replace(request, x0=tuple(x0) or request.x0)
         run = CarRun(request, self._vehicle, 1, self._settings.instruments)
         with uncollected():
             drive_lockstep(run, 0, exchange)
@@ -197,6 +183,13 @@ class Rig:
             yaw * fastest / car.wheelbase_m, steered * car.delta_max_rad,
         )  # fmt: skip
         return [float(one) for one in numbers]
+
+
+def _timed(call: Callable[[], object]) -> float:
+    """Processor time that this thread takes [ms]."""
+    begin_ns = time.thread_time_ns()
+    call()
+    return 1e-6 * (time.thread_time_ns() - begin_ns)
 
 
 def _roughened(weights: Weights, capacity: int, seed: int) -> Weights:
@@ -229,6 +222,6 @@ def search(rig: Rig, cases: int, seed: int, counted: bool) -> Iterator[tuple[Cas
             case = Case.drawn(names[number % len(names)], len(rig.tracks), random)
         else:
             case = worst[int(random.integers(len(worst)))][1].changed(random)
-        rows = rig.run(case, budget=0.0)
+        rows = rig.run(case, budget_s=0.0)
         worst = sorted([*worst, (work(rows, counted), case)], key=lambda one: -one[0])[:5]
         yield case, rows

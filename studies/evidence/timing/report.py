@@ -33,8 +33,7 @@ def print_study(study: Study, console: Console) -> None:
     result = study.result
     table = plain_table("phase [ms]", "p50", "p99", "p99.9", "max", "level", padding=0)
     for one in result.times:
-        usable = one.tail is not None and not one.tail.rejected
-        level = f"{one.tail.upper:.3g}" if one.tail and usable else "rejected" if one.tail else ""
+        level = f"{one.usable.upper:.3g}" if one.usable else "rejected" if one.tail else ""
         table.add_row(one.name, *(f"{v:.3f}" for v in (one.p50, one.p99, one.p999, one.max)), level)
     console.print(table)
     counts = ", ".join(f"{count} {name}" for name, count in result.cycles.items())
@@ -67,11 +66,11 @@ def _plot(path: Path, study: Study) -> None:
                 share = 1 - np.arange(len(ms)) / len(ms)
                 axes.step(ms, share, where="pre", color=colour, label=phase)
             for one in result.times:
-                if one.name.startswith(name) and one.tail and not one.tail.rejected:
-                    x = np.geomspace(one.tail.threshold, one.tail.upper, 200)
+                if one.name.startswith(name) and (tail := one.usable):
+                    x = np.geomspace(tail.threshold, tail.upper, 200)
                     colour = _COLOURS[one.name.split()[1]]
-                    axes.plot(x, one.tail.survival(x), ":", color=colour)
-                    axes.plot(one.tail.upper, one.tail.exceedance, "o", color=colour)
+                    axes.plot(x, tail.survival(x), ":", color=colour)
+                    axes.plot(tail.upper, tail.exceedance, "o", color=colour)
             axes.axvline(result.limit_ms, color=WARNING, linewidth=1)
             axes.set(xscale="log", yscale="log", xlabel="processor time [ms]")
             axes.set_title(name, color=INK, loc="left")

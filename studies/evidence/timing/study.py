@@ -2,6 +2,7 @@
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -41,6 +42,11 @@ class Times(BaseModel):
     max: float
     tail: Tail | None
     """Of the answer and the fallback to recorded problems; None: not fitted, or too few."""
+
+    @property
+    def usable(self) -> Tail | None:
+        """The tail, where it is not rejected."""
+        return None if self.tail is None or self.tail.rejected else self.tail
 
 
 class Hardest(BaseModel):
@@ -86,24 +92,36 @@ def run_timing(settings: TimingSettings, logs: Sequence[Path], stages: Stages) -
     prepared = prepare(
         settings, settings.driven_on, stages, weights=settings.weights, artefact=settings.artefact
     )
-    counter = InstructionCounter()
-    try:
+    with closing(InstructionCounter()) as counter:
         rig, counted = Rig(settings, prepared, counter), not counter.missing
         with stages.stage("recorded problems"):
             recorded = list(_recorded(rig, runs, settings.problems))
         with stages.stage("search for the worst") as stage:
-            found: list[tuple[Case, Floats]] = []
+            found = list[tuple[Case, Floats]]()
             for one in search(rig, settings.cases, settings.seed, counted):
                 found.append(one)
                 stage.update(len(found) / (2 * settings.cases))
         with stages.stage("adversarial problems"):
             adversarial = [rig.run(case) for case, _ in found]
-    finally:
-        counter.close()
     found.sort(key=lambda one: -work(one[1], counted))
+    drives = {"recorded": recorded, "adversarial": adversarial}
     everything = np.vstack([*recorded, *adversarial, *(rows for _, rows in found)])
-    return _judged(settings, rig, counter.missing, recorded, np.vstack(adversarial), found,
-                   everything)  # fmt: skip
+    values = {
+        f"{name} {phase}": ms
+        for name, some in drives.items()
+        for phase, ms in _phases(np.vstack(some)).items()
+    }
+    times = tuple(_times(name, ms, recorded, settings.exceedance) for name, ms in values.items())
+    result = TimingResult(
+        car=settings.car.name, tracks=tuple(one.track.name for one in rig.tracks),
+        rate_hz=settings.rate_hz, limit_ms=settings.limit_ms, horizon=rig.horizon,
+        cycles={name: sum(map(len, some)) for name, some in drives.items()},
+        times=times, hardest=tuple(_hardest(rig, everything, counted)), counter=counter.missing,
+        worst=tuple(_text(rig, case, rows) for case, rows in found[:5]),
+        statement=_statement(next(one for one in times if one.name == "recorded answer")),
+    )  # fmt: skip
+    checks = sorted(_checks(result, len(everything)), key=lambda one: one.subject)
+    return Study(result, Verdict("timing", tuple(checks)), values)
 
 
 def _runs(logs: Sequence[Path]) -> Iterator[list[State]]:
@@ -130,8 +148,9 @@ def _recorded(rig: Rig, runs: Sequence[list[State]], problems: int) -> Iterator[
 
 
 def _phases(rows: Floats) -> dict[str, Floats]:
-    columns = dict(zip(COLUMNS, rows.T, strict=True))
-    return {**columns, "answer": columns["estimate"] + columns["feedback"]}
+    estimate, feedback, prepare, fallback = rows[:, :4].T
+    times = estimate, feedback, estimate + feedback, prepare, fallback
+    return dict(zip(PHASES, times, strict=True))
 
 
 def _blocks(drives: Sequence[Floats], phase: str) -> Floats:
@@ -141,61 +160,48 @@ def _blocks(drives: Sequence[Floats], phase: str) -> Floats:
     return np.concatenate([one.max(axis=1) for one in whole if one.size] or [np.zeros(0)])
 
 
-def _judged(
-    settings: TimingSettings, rig: Rig, missing: str, recorded: list[Floats], adversarial: Floats,
-    found: list[tuple[Case, Floats]], everything: Floats,
-) -> Study:  # fmt: skip
-    values, times, checks = dict[str, Floats](), list[Times](), list[Check]()
-    limit = settings.limit_ms
-    for name, rows in (("recorded", np.vstack(recorded)), ("adversarial", adversarial)):
-        for phase in PHASES:
-            ms = values[f"{name} {phase}"] = _phases(rows)[phase]
-            p50, p99, p999, most = np.percentile(ms, [50, 99, 99.9, 100]).tolist()
-            fitted = name == "recorded" and phase in ("answer", "fallback")
-            tail = fit_tail(_blocks(recorded, phase), settings.exceedance) if fitted else None
-            times.append(
-                Times(name=f"{name} {phase}", p50=p50, p99=p99, p999=p999, max=most, tail=tail)
-            )
-            if phase in ("answer", "prepare", "fallback"):
-                what = f"{name}: at most {limit:g} ms"
-                checks.append(Check(phase, what, most <= limit, f"{most:.3g} ms of {len(ms)}"))
-            if tail and not tail.rejected:
-                what = f"all but {tail.exceedance:g} of the blocks: at most {limit:g} ms"
-                text = f"{tail.upper:.3g} ms with confidence {tail.confidence:.0%}"
-                checks.append(Check(phase, what, tail.upper <= limit, text))
-    hardest = tuple(
-        Hardest(name=name, most=int(everything[:, COLUMNS.index(name)].max()), bound=bound)
-        for name, bound in (
-            ("iterations", rig.most_iterations), ("qp_steps", rig.most_qp_steps),
-            ("instructions", 0),
-        )
-        if name != "instructions" or not missing
-    )  # fmt: skip
-    for one in hardest:
-        if one.bound:
-            text = f"{one.most} of {len(everything)} feedbacks"
-            what = f"by construction at most {one.bound} {one.name}"
-            checks.append(Check("work of a feedback", what, one.most <= one.bound, text))
-    checks.sort(key=lambda one: one.subject)
-    result = TimingResult(
-        car=settings.car.name, tracks=tuple(one.track.name for one in rig.tracks),
-        rate_hz=settings.rate_hz, limit_ms=limit, horizon=rig.horizon,
-        cycles={"recorded": sum(map(len, recorded)), "adversarial": len(adversarial)},
-        times=tuple(times), hardest=hardest, counter=missing,
-        worst=tuple(
-            f"{case.kind} on {rig.tracks[case.track].track.name}: "
-            f"{int(rows[:, 4].max())} iterations, {int(rows[:, 5].max())} QP steps"
-            for case, rows in found[:5]
-        ),
-        statement=_statement(next(one for one in times if one.name == "recorded answer")),
-    )  # fmt: skip
-    return Study(result, Verdict("timing", tuple(checks)), values)
+def _times(name: str, ms: Floats, recorded: Sequence[Floats], exceedance: float) -> Times:
+    p50, p99, p999, most = np.percentile(ms, [50, 99, 99.9, 100]).tolist()
+    fitted = name in ("recorded answer", "recorded fallback")
+    tail = fit_tail(_blocks(recorded, name.split()[1]), exceedance) if fitted else None
+    return Times(name=name, p50=p50, p99=p99, p999=p999, max=most, tail=tail)
+
+
+def _hardest(rig: Rig, everything: Floats, counted: bool) -> Iterator[Hardest]:
+    bounds = {"iterations": rig.most_iterations, "qp_steps": rig.most_qp_steps}
+    for name, bound in (bounds | ({"instructions": 0} if counted else {})).items():
+        most = int(everything[:, COLUMNS.index(name)].max())
+        yield Hardest(name=name, most=most, bound=bound)
+
+
+def _text(rig: Rig, case: Case, rows: Floats) -> str:
+    iterations, qp_steps = rows[:, 4:6].max(axis=0).astype(int)
+    track = rig.tracks[case.track].track.name
+    return f"{case.kind} on {track}: {iterations} iterations, {qp_steps} QP steps"
+
+
+def _checks(result: TimingResult, feedbacks: int) -> Iterator[Check]:
+    limit = result.limit_ms
+    for one in result.times:
+        problems, phase = one.name.split()
+        if phase in ("answer", "prepare", "fallback"):
+            text = f"{one.max:.3g} ms of {result.cycles[problems]}"
+            yield Check(phase, f"{problems}: at most {limit:g} ms", one.max <= limit, text)
+        if one.usable:
+            what = f"all but {one.usable.exceedance:g} of the blocks: at most {limit:g} ms"
+            text = f"{one.usable.upper:.3g} ms with confidence {one.usable.confidence:.0%}"
+            yield Check(phase, what, one.usable.upper <= limit, text)
+    for hard in result.hardest:
+        if hard.bound:
+            what = f"by construction at most {hard.bound} {hard.name}"
+            text = f"{hard.most} of {feedbacks} feedbacks"
+            yield Check("work of a feedback", what, hard.most <= hard.bound, text)
 
 
 def _statement(answer: Times) -> str:
-    tail = answer.tail
-    if tail is None or tail.rejected:
-        why = f"the fit is rejected: {tail.rejected}" if tail else "too few different times"
+    if (tail := answer.usable) is None:
+        rejected = answer.tail and f"the fit is rejected: {answer.tail.rejected}"
+        why = rejected or "too few different times"
         return f"The answer took at most {answer.max:.3g} ms; nothing is stated beyond it: {why}."
     return (
         f"The controller answers within {tail.upper:.3g} ms with confidence {tail.confidence:.0%} "

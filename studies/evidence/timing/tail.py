@@ -9,7 +9,9 @@ upper confidence limit by the profile likelihood (Coles 2001, section 4.3.3).
 from typing import Final
 
 import numpy as np
+from numpy.typing import ArrayLike
 from pydantic import BaseModel
+from scipy.optimize import brentq, minimize_scalar
 from scipy.stats import chi2, genpareto
 
 from bayesrace.arrays import Floats
@@ -65,87 +67,68 @@ class Tail(BaseModel):
 def fit_tail(
     values: Floats, exceedance: float, confidence: float = 0.95, samples: int = 199
 ) -> Tail | None:
-    """The tail of independent values (n,); None where there are too few, or too many alike.
+    """The tail of independent values (n,); None where there are too few, or too many alike, or the
+    level would not be above the threshold.
 
     ``samples``: of the bootstrap behind the goodness of fit.
     """
     threshold = float(np.quantile(values, 1 - _OVER))
     y = values[values > threshold] - threshold
-    if len(y) < LEAST_PEAKS or len(np.unique(y)) < LEAST_PEAKS // 2:
+    share = len(y) / len(values)
+    if len(y) < LEAST_PEAKS or len(np.unique(y)) < LEAST_PEAKS // 2 or share <= exceedance:
         return None
-    share, random = len(y) / len(values), np.random.default_rng(0)
     shape, scale = _fit(y)
-    rarer = max(share / exceedance, 1.0)
-    level = scale * float(_growth(np.array(shape), rarer))
-    gain = _log_likelihood(y, shape, scale) - _log_likelihood(y, 0.0, float(y.mean()))
-    drawn = (
-        np.asarray(genpareto.rvs(shape, scale=scale, size=len(y), random_state=random))
-        for _ in range(samples)
-    )
-    worse = sum(_anderson(one, *_fit(one)) >= _anderson(y, shape, scale) for one in drawn)
+    level = float(genpareto.isf(exceedance / share, shape, scale=scale))
+    gain = float((_log_likelihood(y, shape, scale) - _log_likelihood(y, 0.0, y.mean()))[0])
+    apart = _anderson(y, shape, scale)
+    drawn = genpareto.rvs(shape, scale=scale, size=(samples, len(y)), random_state=0)
+    worse = sum(_anderson(one, *_fit(one)) >= apart for one in drawn)
     return Tail(
         threshold=threshold, peaks=len(y), share=share, shape=shape, scale=scale,
         exceedance=exceedance, confidence=confidence,
-        level=threshold + level, upper=threshold + _upper(y, rarer, level, confidence),
+        level=threshold + level,
+        upper=threshold + _upper(y, exceedance / share, level, confidence),
         goodness_p=(1 + worse) / (1 + samples),
         light_p=0.5 * float(chi2.sf(2 * max(gain, 0.0), 1)) if shape > 0 else 1.0,
     )  # fmt: skip
 
 
-def _growth(shape: Floats, rarer: float) -> Floats:
-    """Of a level exceeded by one of so many peaks, in scales."""
-    small = np.abs(shape) < 1e-9
-    safe = np.where(small, 1.0, shape)
-    grown: Floats = np.where(small, np.log(rarer), np.expm1(safe * np.log(rarer)) / safe)
-    return grown
-
-
-def _log_likelihoods(y: Floats, shapes: Floats, scales: Floats) -> Floats:
-    """Of each pair of shape and scale, (k,); -inf where a peak is beyond the law's end."""
-    shapes = np.where(np.abs(shapes) < 1e-9, 1e-9, shapes)
-    z = 1 + (shapes / scales)[:, None] * y
-    inside = (z > 0).all(axis=1)
-    logs = np.log(np.where(z > 0, z, 1.0)).sum(axis=1)
-    return np.where(inside, -len(y) * np.log(scales) - (1 + 1 / shapes) * logs, -np.inf)
-
-
-def _log_likelihood(y: Floats, shape: float, scale: float) -> float:
-    return float(_log_likelihoods(y, np.array([shape]), np.array([scale]))[0])
+def _log_likelihood(y: Floats, shapes: ArrayLike, scales: ArrayLike) -> Floats:
+    """Of each pair of shape and scale, (k,)."""
+    shapes, scales = (np.reshape(one, (-1, 1)) for one in (shapes, scales))
+    return np.asarray(genpareto.logpdf(y, shapes, scale=scales).sum(axis=1))
 
 
 def _fit(y: Floats) -> tuple[float, float]:
     """Shape and scale of the largest likelihood, by one number, their quotient (Grimshaw 1993)."""
-    end, mean = 1 / y.max(), 1 / y.mean()
-    below, above = -end * (1 - np.geomspace(1e-4, 0.999, 60)), mean * np.geomspace(1e-4, 20, 60)
-    quotients: Floats = np.concatenate([below, above])
-    for _ in range(3):
-        shapes = np.log1p(quotients[:, None] * y).mean(axis=1)
-        scales = shapes / quotients
-        likely = -np.log(scales) - shapes - 1
-        likely[(shapes < _SHAPES[0]) | (shapes > _SHAPES[1])] = -np.inf
-        best = int(np.argmax(likely))
-        found = float(shapes[best]), float(scales[best])
-        around = quotients[[max(best - 1, 0), min(best + 1, len(quotients) - 1)]].tolist()
-        quotients = np.linspace(around[0], around[1], 40)
-        quotients = quotients[quotients != 0]
-    return found
+
+    def shape(quotient: float) -> float:
+        return float(np.log1p(quotient * y).mean())
+
+    def cost(quotient: float) -> float:
+        return float(np.log(shape(quotient) / quotient)) + shape(quotient)
+
+    low, high = (-1 + 1e-9) / y.max(), 7 / np.median(y)  # there the shape is above 1
+    high = brentq(lambda at: shape(at) - _SHAPES[1], low, high)
+    if shape(low) < _SHAPES[0]:
+        low = brentq(lambda at: shape(at) - _SHAPES[0], low, high)
+    quotient = minimize_scalar(cost, bounds=(low, high), method="bounded").x
+    return shape(quotient), shape(quotient) / quotient
 
 
-def _upper(y: Floats, rarer: float, level: float, confidence: float) -> float:
-    """One-sided limit of the level: where the profile likelihood has fallen far enough."""
-    growth = _growth(_GRID, rarer)
+def _upper(y: Floats, exceedance: float, level: float, confidence: float) -> float:
+    """One-sided limit of the level that a peak exceeds so seldom: where the profile likelihood has
+    fallen far enough."""
+    growth = genpareto.isf(exceedance, _GRID)
 
     def profile(at: float) -> float:
-        return float(_log_likelihoods(y, _GRID, at / growth).max())
+        return float(_log_likelihood(y, _GRID, at / growth).max())
 
     least = profile(level) - 0.5 * float(chi2.ppf(2 * confidence - 1, 1))
-    low, high = level, 2 * level
-    while profile(high) > least and high < 1e9 * level:
-        low, high = high, 2 * high
-    for _ in range(40):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if profile(middle) > least else (low, middle)
-    return high
+    high = 2 * level
+    while profile(high) > least:
+        high *= 2
+    return float(brentq(lambda at: profile(at) - least, level, high, rtol=1e-6))
 
 
 def _anderson(y: Floats, shape: float, scale: float) -> float:
