@@ -27,7 +27,7 @@ from bayesrace.messages import (
 from bayesrace.operation.closed_loop import built_in_car
 from bayesrace.operation.driving_system import DrivingSystem, Part
 from bayesrace.operation.run_plan import RunPlan, announcement, run_request
-from bayesrace.operation.simulation.network import Direction, Network, Session
+from bayesrace.operation.simulation.network import Network, Session
 from bayesrace.operation.simulation.scheduler import Scheduler, Task
 from bayesrace.plant.process import PlantProcess
 from bayesrace.plant.process_settings import PlantSettings
@@ -87,10 +87,7 @@ class SimulatedSystem(DrivingSystem):
         self._look_ns = round(look_us * 1e3)
         self._scheduler = Scheduler()
         self._network = Network(self._scheduler, ("plant", "controller"), seed)
-        self.ways: dict[Part, Direction] = {
-            "controller": self._network.ways["plant", "controller"],
-            "plant": self._network.ways["controller", "plant"],
-        }
+        self.ways = self._network.ways
         """Between the two, by who receives."""
         for way in self.ways.values():
             way.link = link
