@@ -79,7 +79,7 @@ class MpcSettings(BaseModel):
         description="the same after a reset; with a time budget the larger limits every step",
     )
     qp_steps: int = Field(
-        4000,
+        6000,
         ge=200,
         le=1_000_000,
         description="active-set steps that all QPs of a step may take together, and those of a "

@@ -39,7 +39,7 @@ from bayesrace.operation.preparation import (
     updated_weights,
 )
 from bayesrace.operation.run_plan import RunPlan
-from bayesrace.operation.settings import RaceSettings
+from bayesrace.operation.settings import PreparationSettings, RaceSettings
 from bayesrace.operation.system import Child, System, child, started_system
 from bayesrace.operation.terminal.terminal import Stages
 from bayesrace.operation.training_drives import PreparedTrack
@@ -229,7 +229,7 @@ def _kept(track: PreparedTrack, out: Path, label: str) -> PreparedTrack:
     return PreparedTrack(track.track, track.line, *files)
 
 
-def plant_options(settings: RaceSettings, out: Path) -> list[str]:
+def plant_options(settings: PreparationSettings, out: Path) -> list[str]:
     """Of ``bayesrace plant``, with the files in ``out`` that they name; the car's is there."""
     files = ("--fmu", settings.fmu), ("--map", settings.fmu_map)
     sensors, changes = out / _SENSORS, settings.changes

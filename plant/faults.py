@@ -8,18 +8,12 @@ stays as it is.
 import json
 import math
 from collections.abc import Callable, Mapping, Sequence
+from operator import neg
 from pathlib import Path
 from typing import Annotated, Any, Final, Self
 
 from msgspec.structs import replace
-from pydantic import (
-    BaseModel,
-    BeforeValidator,
-    ConfigDict,
-    Field,
-    RootModel,
-    model_validator,
-)
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, RootModel, model_validator
 
 from bayesrace.defaults import Option
 from bayesrace.errors import InputError
@@ -49,8 +43,7 @@ def _changed(**what: _Number) -> StateFault:
 
     def report(states: Sequence[State]) -> State:
         x = zip(QUANTITIES, states[-1].x, strict=True)
-        same: _Number = float
-        return replace(states[-1], x=tuple(what.get(name, same)(value) for name, value in x))
+        return replace(states[-1], x=tuple(what.get(name, float)(value) for name, value in x))
 
     return report
 
@@ -83,10 +76,6 @@ def _nought(_: float) -> float:
     return 0.0
 
 
-def _negative(value: float) -> float:
-    return -value
-
-
 STATE_FAULTS: Final[Mapping[str, StateFault]] = {
     "frozen": _held(0),
     "position frozen": _held(0, 0, 3),
@@ -96,12 +85,10 @@ STATE_FAULTS: Final[Mapping[str, StateFault]] = {
     "heading in degrees": _changed(psi=math.degrees),
     "speed in km/h": _changed(vx=lambda v: 3.6 * v, vy=lambda v: 3.6 * v),
     "position in mm": _changed(x=lambda x: 1e3 * x, y=lambda y: 1e3 * y),
-    "vx negative": _changed(vx=_negative),
+    "vx negative": _changed(vx=neg),
     "vy, omega, delta at 0": _changed(vy=_nought, omega=_nought, delta=_nought),
-    "omega mirrored": _changed(omega=_negative),
-    "mirrored": _changed(
-        y=_negative, psi=_negative, vy=_negative, omega=_negative, delta=_negative
-    ),
+    "omega mirrored": _changed(omega=neg),
+    "mirrored": _changed(y=neg, psi=neg, vy=neg, omega=neg, delta=neg),
     "x and y exchanged": _swapped(1, 0, 2, 3, 4, 5, 6),
     "vx and vy exchanged": _swapped(0, 1, 2, 4, 3, 5, 6),
     "late by 5 periods": _late,
@@ -119,7 +106,7 @@ def _reading(**what: _Number) -> ReadingFault:
 
     def report(one: Reading, _: Reading) -> Reading:
         values = {
-            name: (what[name](value) if name in what else value, deviation)
+            name: (what.get(name, float)(value), deviation)
             for name, (value, deviation) in one.values.items()
         }
         return replace(one, values=values)
@@ -127,27 +114,18 @@ def _reading(**what: _Number) -> ReadingFault:
     return report
 
 
-def _frozen(one: Reading, good: Reading) -> Reading:
-    return replace(one, values=good.values)
-
-
 def _dated_reading(by_s: float) -> ReadingFault:
     return lambda one, _: replace(one, time_s=one.time_s + by_s)
 
 
-def _stopped(_: Reading, __: Reading) -> None:
-    return None
-
-
 def _drifting(one: Reading, good: Reading) -> Reading | None:
     """By 1 m/s."""
-    off = one.time_s - good.time_s
-    return _reading(x=lambda x: x + off)(one, good)
+    return _reading(x=lambda x: x + (one.time_s - good.time_s))(one, good)
 
 
 READING_FAULTS: Final[Mapping[str, ReadingFault]] = {
-    "frozen": _frozen,
-    "stopped": _stopped,
+    "frozen": lambda one, good: replace(one, values=good.values),
+    "stopped": lambda _, __: None,
     "drifting": _drifting,
     "of the future": _dated_reading(0.1),
     "of the past": _dated_reading(-10.0),
@@ -156,7 +134,7 @@ READING_FAULTS: Final[Mapping[str, ReadingFault]] = {
     "heading turned round": _reading(psi=lambda psi: psi + math.pi),
     "speed at 0": _reading(vx=_nought),
     "speed in km/h": _reading(vx=lambda v: 3.6 * v),
-    "speed negative": _reading(vx=_negative),
+    "speed negative": _reading(vx=neg),
     "yaw rate in degrees": _reading(omega=lambda omega: math.degrees(omega) + 30),
     "yaw rate jumped": _reading(omega=lambda omega: omega + 2),
 }

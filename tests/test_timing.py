@@ -151,7 +151,7 @@ def test_the_verdict_is_by_the_limit_and_files_are_left(
     assert failing == ({"answer", "prepare", "fallback"} if code else set())
     content = json.loads((tmp_path / "timing.json").read_text())
     assert content["cycles"] == {"recorded": 900, "adversarial": 100}
-    assert [one["bound"] for one in content["hardest"]][:2] == [90, 4000]
+    assert [one["bound"] for one in content["hardest"]][:2] == [90, 6000]
     assert content["statement"] in " ".join((tmp_path / "text").read_text().split())
     assert (tmp_path / "timing.png").stat().st_size > 10_000
     assert len(np.load(tmp_path / "times.npz")["recorded answer"]) == 900

@@ -13,16 +13,18 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
 from bayesrace.transport.endpoints import address_of, free_endpoint
 
-__all__ = ["AGAIN", "IDEAL", "Link", "Relay"]
+__all__ = ["AGAIN", "IDEAL", "Link", "Relay", "Way"]
 
 AGAIN: Final = 4
 """After so many times the delay, two round trips, TCP sends again what was lost."""
 _DATAGRAM: Final = 1 << 16
+
+Receive = Callable[[], bytes]
+Send = Callable[[bytes], object]
 
 
 class Link(NamedTuple):
@@ -37,15 +39,6 @@ class Link(NamedTuple):
     """As TCP: what is lost arrives later, and holds up what comes after it. Otherwise as UDP: it
     does not arrive, and later messages overtake earlier ones."""
 
-    def loses(self, chance: random.Random) -> bool:
-        """Whether the next message is lost."""
-        return chance.random() < self.loss
-
-    def way_s(self, chance: random.Random, lost: bool) -> float:
-        """Time on the way, at least 0; of one that was ``lost`` until it has come once more."""
-        way_s = self.delay_s + chance.uniform(-self.jitter_s, self.jitter_s)
-        return max(way_s + (AGAIN * self.delay_s if lost else 0.0), 0.0)
-
 
 IDEAL: Final = Link()
 
@@ -55,26 +48,33 @@ def _address(endpoint: str) -> tuple[str, int]:
     return address.host, address.port
 
 
-def _opened() -> threading.Event:
-    event = threading.Event()
-    event.set()
-    return event
+class Way:
+    """One direction over a link."""
 
-
-@dataclass
-class _Way:
-    """One direction over the link."""
-
-    chance: random.Random
-    open: threading.Event = field(default_factory=_opened)
-    link: Link = IDEAL
-    lost: int = 0
+    def __init__(self, seed: str) -> None:
+        self.link, self.lost = IDEAL, 0
+        self._chance = random.Random(seed)  # noqa: S311 (no secret)
 
     def loses(self) -> bool:
-        """Whether what passes next is lost, which is counted."""
-        lost = self.link.loses(self.chance)
+        """Whether the next message is lost, which is counted."""
+        lost = self._chance.random() < self.link.loss
         self.lost += lost
         return lost
+
+    def way_s(self, lost: bool) -> float:
+        """Time on the way, at least 0; of one that was ``lost`` until it has come once more."""
+        link = self.link
+        way_s = link.delay_s + self._chance.uniform(-link.jitter_s, link.jitter_s)
+        return max(way_s + (AGAIN * link.delay_s if lost else 0.0), 0.0)
+
+
+class _RelayedWay(Way):
+    """That can be held up."""
+
+    def __init__(self, seed: str) -> None:
+        super().__init__(seed)
+        self.open = threading.Event()
+        self.open.set()
 
 
 class Relay:
@@ -92,10 +92,7 @@ class Relay:
         self._lock = threading.Lock()
         self._sockets: list[socket.socket] = []
         self._listener: socket.socket | None = None
-        self._ways = {
-            name: _Way(random.Random(name))  # noqa: S311 (no secret)
-            for name in ("forth", "back")
-        }
+        self._ways = {name: _RelayedWay(name) for name in ("forth", "back")}
         self.join()
 
     def set(self, delay_s: float = 0.0, jitter_s: float = 0.0, loss: float = 0.0) -> None:
@@ -117,7 +114,7 @@ class Relay:
         for way in self._chosen(direction):
             way.open.set()
 
-    def _chosen(self, direction: str) -> list[_Way]:
+    def _chosen(self, direction: str) -> list[_RelayedWay]:
         return [self._ways[direction]] if direction else list(self._ways.values())
 
     @property
@@ -198,18 +195,11 @@ class Relay:
             client[:] = [sender]
             return data
 
-        def to_target(data: bytes) -> None:
-            far.sendto(data, _address(self._target))
+        target = _address(self._target)
+        self._pass_on("back", from_client, lambda data: far.sendto(data, target))
+        self._pass_on("forth", lambda: far.recv(_DATAGRAM), lambda data: near.sendto(data, *client))
 
-        def to_client(data: bytes) -> None:
-            near.sendto(data, *client)
-
-        self._pass_on("back", from_client, to_target)
-        self._pass_on("forth", lambda: far.recv(_DATAGRAM), to_client)
-
-    def _pass_on(
-        self, direction: str, receive: Callable[[], bytes], send: Callable[[bytes], object]
-    ) -> None:
+    def _pass_on(self, direction: str, receive: Receive, send: Send) -> None:
         """Each datagram takes its own time."""
         way = self._ways[direction]
 
@@ -221,20 +211,13 @@ class Relay:
             with suppress(OSError):
                 while data := receive():
                     if not way.loses() and way.open.is_set():
-                        way_s = way.link.way_s(way.chance, lost=False)
-                        later = threading.Timer(way_s, deliver, (data,))
+                        later = threading.Timer(way.way_s(lost=False), deliver, (data,))
                         later.daemon = True
                         later.start()
 
         threading.Thread(target=take, daemon=True).start()
 
-    def _start(
-        self,
-        direction: str,
-        receive: Callable[[], bytes],
-        send: Callable[[bytes], object],
-        end: Callable[[], None],
-    ) -> None:
+    def _start(self, direction: str, receive: Receive, send: Send, end: Callable[[], None]) -> None:
         """Relays a stream in its order, until there is nothing to receive any more."""
         way, waiting = self._ways[direction], queue.Queue[tuple[float, bytes]](10_000)
 
@@ -242,8 +225,7 @@ class Relay:
             due_s = 0.0
             with suppress(OSError):
                 while data := receive():
-                    way_s = way.link.way_s(way.chance, way.loses())
-                    due_s = max(due_s, time.monotonic() + way_s)
+                    due_s = max(due_s, time.monotonic() + way.way_s(way.loses()))
                     waiting.put((due_s, data))
             waiting.put((0.0, b""))
 

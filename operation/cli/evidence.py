@@ -10,12 +10,27 @@ from bayesrace.operation.cli import options
 from bayesrace.operation.cli.declaration import Given, options_of
 
 if TYPE_CHECKING:
+    from bayesrace.studies.evidence.scenario.run import Result
     from bayesrace.studies.evidence.timing.settings import TimingSettings
     from bayesrace.studies.evidence.verdict import Verdict
 
 __all__ = ["replay", "scenario", "shadow", "timing"]
 
-_JUNIT: Final = options.new_file("Write the verdict as JUnit XML to this file.", "--junit")
+
+def _with_folder(path: Path | None) -> Path | None:
+    """Callback of ``--junit``: the file may be in the folder that ``--out`` is to make."""
+    if path is not None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    return options.writable(path)
+
+
+_JUNIT: Final = options.value(
+    "Write the verdict as JUnit XML to this file.",
+    None,
+    "--junit",
+    metavar="FILE",
+    callback=_with_folder,
+)
 
 
 def _end(verdict: "Verdict", junit: Path | None, left: Path | None = None) -> None:
@@ -125,11 +140,15 @@ def scenario(
 
 def drive_and_judge(scenarios: Any, folder: Path, junit: Path | None, workers: int) -> None:
     """Drives, prints the verdict, leaves the report, and exits by it."""
+    from bayesrace.operation.terminal import printable
     from bayesrace.studies.evidence.scenario.report import write_report
     from bayesrace.studies.evidence.scenario.run import run_scenarios, verdict_of
 
+    def show(result: "Result") -> None:
+        typer.echo(printable(f"{result.name}: {verdict_of([result]).text}"))
+
     with options.stages_shown() as stages:
-        results = run_scenarios(scenarios, folder, stages, workers)
+        results = run_scenarios(scenarios, folder, stages, workers, show)
     _end(verdict_of(results), junit, write_report(results, folder))
 
 

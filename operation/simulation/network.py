@@ -5,7 +5,6 @@ Between all others messages take no time. What a link does is what the relay doe
 (:mod:`bayesrace.transport.relay`).
 """
 
-import random
 from collections import deque
 from collections.abc import Callable
 from types import SimpleNamespace
@@ -15,31 +14,29 @@ import zenoh
 
 from bayesrace.operation.simulation.scheduler import Scheduler
 from bayesrace.transport import NEWEST
-from bayesrace.transport.relay import IDEAL
+from bayesrace.transport.relay import Way
 
 __all__ = ["Direction", "Network", "Session"]
 
 
-class Direction:
+class Direction(Way):
     """One way between two sessions."""
 
     def __init__(self, scheduler: Scheduler, seed: str) -> None:
-        self._scheduler, self._random = scheduler, random.Random(seed)  # noqa: S311 (no secret)
-        self.link, self.lost, self.held = IDEAL, 0, False
+        super().__init__(seed)
+        self._scheduler, self.held = scheduler, False
         self._free_ns = 0
         """When the last ordered message arrives."""
         self._waiting: deque[Callable[[], None]] = deque()
 
     def send(self, deliver: Callable[[], None]) -> None:
         """Calls ``deliver`` when the message arrives, if it does."""
-        link, now_ns = self.link, self._scheduler.monotonic_ns()
-        lost = link.loses(self._random)
-        self.lost += lost
-        if not link.ordered and (lost or self.held):
+        ordered, now_ns, lost = self.link.ordered, self._scheduler.monotonic_ns(), self.loses()
+        if not ordered and (lost or self.held):
             self.lost += not lost
             return
-        arrives_ns = now_ns + round(1e9 * link.way_s(self._random, lost))
-        if link.ordered:
+        arrives_ns = now_ns + round(1e9 * self.way_s(lost))
+        if ordered:
             arrives_ns = self._free_ns = max(self._free_ns, arrives_ns)
         self._scheduler.call_at(arrives_ns, lambda: self._arrive(deliver))
 
@@ -160,8 +157,9 @@ class Network:
         """``ends``: names of the two sessions with the link between them."""
         self._scheduler, self._sessions = scheduler, list[Session]()
         self.ways = {
-            way: Direction(scheduler, f"{seed} {' '.join(way)}") for way in (ends, ends[::-1])
+            to: Direction(scheduler, f"{seed} {sender} {to}") for sender, to in (ends, ends[::-1])
         }
+        """Between these two, by who receives."""
         self.served: dict[str, tuple[Session, Callable[[Query], None]]] = {}
         self._tokens: dict[str, Session] = {}
         self._watching: list[_Declared] = []
@@ -201,11 +199,10 @@ class Network:
                 self._carry(sender, session, one, sample)
 
     def _carry(self, sender: Session, to: Session, one: _Declared, sample: _Sample) -> None:
-        way = self.ways.get((sender.name, to.name))
-        if way is None:
-            one.offer(sample)
+        if {sender.name, to.name} == self.ways.keys():
+            self.ways[to.name].send(lambda: one.offer(sample))
         else:
-            way.send(lambda: one.offer(sample))
+            one.offer(sample)
 
     def ask(self, key: str, data: bytes) -> Query:
         """Hands the request to the process that serves the key; it answers when it gets to it."""

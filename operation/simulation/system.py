@@ -3,7 +3,7 @@
 import time
 from collections.abc import Callable
 from functools import partial
-from typing import Any, Final, Literal, Self, TypeVar
+from typing import Any, Final, Self, TypeVar
 
 from bayesrace import clock
 from bayesrace.controller.interface import Controller
@@ -12,28 +12,22 @@ from bayesrace.controller.process_settings import ControllerSettings
 from bayesrace.errors import InputError
 from bayesrace.log import LogWriter
 from bayesrace.messages import (
-    COMMAND,
     EVENT,
     EVERYTHING,
     ROLLBACK,
     RUN,
-    STATUS,
     WEIGHTS,
-    Command,
     Event,
     Message,
-    Reply,
-    RollbackRequest,
     Service,
-    Status,
-    StatusRequest,
     car_key,
     decode,
     encode,
 )
 from bayesrace.operation.closed_loop import built_in_car
+from bayesrace.operation.driving_system import DrivingSystem, Part
 from bayesrace.operation.run_plan import RunPlan, announcement, run_request
-from bayesrace.operation.simulation.network import Direction, Network, Query, Session
+from bayesrace.operation.simulation.network import Network, Session
 from bayesrace.operation.simulation.scheduler import Scheduler, Task
 from bayesrace.plant.process import PlantProcess
 from bayesrace.plant.process_settings import PlantSettings
@@ -43,28 +37,23 @@ from bayesrace.tracks import Track
 from bayesrace.transport.relay import IDEAL, Link
 from bayesrace.transport.requests import in_transport_thread
 
-__all__ = ["Part", "SimulatedSystem"]
+__all__ = ["SimulatedSystem"]
 
 A = TypeVar("A", bound=Message)
 
-Part = Literal["plant", "controller"]
-
-_PLANT: Final = "plant"
-_CONTROLLER: Final = "controller"
 _EPOCH: Final = 1
-_REASON: Final = "asked for"
 
-_LOOK_NS: Final = 1_000_000
-"""Between two looks for an answer, or for the end of a run."""
+_LOOK_S: Final = 1e-3
+"""Between two looks for an answer."""
 _PATIENCE_S: Final = 30.0
-"""For work that takes real time, such as judging weights."""
+"""For judging weights, which takes real time."""
 _OVERTIME_S: Final = 300.0
 """After a run's time limit; it has ended long before."""
 _LOOK_US: Final = 15.0
 """From one look of the compiled step at its clock to the next."""
 
 
-class SimulatedSystem:
+class SimulatedSystem(DrivingSystem):
     """A plant and a controller process on a simulated clock and network; ``with`` it.
 
     Only one at a time in a process: its clock is that of all loops. Messages are written to the
@@ -97,12 +86,9 @@ class SimulatedSystem:
         self._vehicle = vehicle or built_in_car(self._plant.car, self._plant.changes)
         self._look_ns = round(look_us * 1e3)
         self._scheduler = Scheduler()
-        self._network = Network(self._scheduler, (_PLANT, _CONTROLLER), seed)
-        self.ways: dict[Part, Direction] = {
-            _CONTROLLER: self._network.ways[_PLANT, _CONTROLLER],
-            _PLANT: self._network.ways[_CONTROLLER, _PLANT],
-        }
-        """Between the two, by who receives; set their ``link``, ``hold`` and ``release`` them."""
+        self._network = Network(self._scheduler, ("plant", "controller"), seed)
+        self.ways = self._network.ways
+        """Between the two, by who receives."""
         for way in self.ways.values():
             way.link = link
         self.controller: ControllerProcess | None = None
@@ -119,8 +105,8 @@ class SimulatedSystem:
         self._session.declare_subscriber(
             car_key(EVERYTHING, self.car), in_transport_thread(self._record)
         )
-        self.start(_PLANT)
-        self.start(_CONTROLLER)
+        self.start("plant")
+        self.start("controller")
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -134,66 +120,69 @@ class SimulatedSystem:
 
     # What happens to them ------------------------------------------------------------------------
 
-    def start(self, part: str) -> None:
+    def start(self, part: Part = "controller") -> None:
         """Starts a process that does not run."""
         if part in self._running:
             raise InputError(f"the {part} runs already; kill it first")
         session = self._network.session(part)
-        run = self._started_plant if part == _PLANT else self._started_controller
-        process = run(session)
+        process = self._plant_on(session) if part == "plant" else self._controller_on(session)
         self._running[part] = session, self._scheduler.start(part, process.serve)
         self.sleep(0.01)
 
-    def kill(self, part: str) -> None:
+    def kill(self, part: str = "controller") -> None:
         """As SIGKILL; its links are closed at once."""
-        if part not in self._running:
-            raise InputError(f"the {part} does not run; start it first")
-        session, task = self._running.pop(part)
+        session, task = self._process(part)
+        del self._running[part]
         self._network.close(session)
         self._scheduler.end(task)
 
-    def pause(self, part: str, seconds: float) -> None:
+    def pause(self, part: Part, seconds: float) -> None:
         """As SIGSTOP, and SIGCONT after so long."""
+        _, task = self._process(part)
+        task.paused_until_ns = clock.monotonic_ns() + round(seconds * 1e9)
+
+    def _process(self, part: str) -> tuple[Session, Task]:
         if part not in self._running:
             raise InputError(f"the {part} does not run; start it first")
-        self._running[part][1].paused_until_ns = clock.monotonic_ns() + round(seconds * 1e9)
+        return self._running[part]
 
-    def stop(self) -> Reply:
-        """The controller slows the car down to standstill."""
-        return self._command("stop")
+    def set_link(self, to: Part, link: Link) -> None:
+        """What happens to messages for that process."""
+        self.ways[to].link = link
 
-    def go(self) -> Reply:
-        """The controller drives again."""
-        return self._command("go")
+    def hold(self, to: Part) -> None:
+        """No message gets there any more."""
+        self.ways[to].hold()
 
-    def _command(self, command: str) -> Reply:
-        now_ns = clock.monotonic_ns()
-        request = Command(seq=0, source_time_ns=now_ns, command=command, text=_REASON)
-        return self.ask(COMMAND, request)
+    def release(self, to: Part) -> None:
+        """What has waited arrives."""
+        self.ways[to].release()
 
-    def publish(self, weights: bytes) -> Reply:
-        """New weights for the controller: its answer, when they are in use or refused. Judging them
-        takes real time, and none of the simulation's."""
-        return self._judged(self._asked(WEIGHTS, weights))
+    def ask(self, service: Service[Any, A], request: Message | bytes, source: str = "") -> A:
+        """A request and its answer. InputError without any.
 
-    def roll_back(self) -> Reply:
-        """Back to the weights before."""
-        request = RollbackRequest(seq=0, source_time_ns=clock.monotonic_ns(), text=_REASON)
-        return self._judged(self._asked(ROLLBACK, encode(request)))
-
-    def _judged(self, query: Query) -> Reply:
-        """The answer of the controller's thread for weights, which lives in real time."""
-        controller = self.controller
-        adoption = None if controller is None else controller._adoption
-        give_up = time.monotonic() + _PATIENCE_S
+        Weights are judged in a thread that lives in real time, during which no simulated time
+        passes; the control loop takes them between two cycles.
+        """
+        data = request if isinstance(request, bytes) else encode(request)
+        try:
+            query = self._network.ask(car_key(service.key, self.car, source), data)
+        except KeyError:
+            raise InputError(f"nobody serves '{service.name}'; start the process") from None
+        adoption = self.controller._adoption if self.controller else None
+        judged = service in (WEIGHTS, ROLLBACK)
+        now, patience_s = clock.monotonic, service.timeout_s
+        if judged:
+            now, patience_s = time.monotonic, _PATIENCE_S
+        give_up_s = now() + patience_s
         while query.answer is None:
-            if adoption is not None and adoption.tasks:
-                self.sleep(1e-3)  # the control loop takes them between two cycles
-            elif time.monotonic() > give_up:
-                raise InputError(f"no answer about weights within {_PATIENCE_S:g} s")
+            if now() > give_up_s:
+                raise InputError(f"no answer to '{service.name}' within {patience_s:g} s")
+            if judged and not (adoption and adoption.tasks):
+                time.sleep(_LOOK_S)
             else:
-                time.sleep(1e-3)
-        return decode(Reply, query.answer)
+                self.sleep(_LOOK_S)
+        return decode(service.answer, query.answer)
 
     # Runs ----------------------------------------------------------------------------------------
 
@@ -223,11 +212,6 @@ class SimulatedSystem:
             raise InputError(f"run {plan.run} did not end")
         return self._ends[-1]
 
-    def status(self, part: str) -> Status:
-        """Of a process, as it answers."""
-        request = StatusRequest(seq=0, source_time_ns=clock.monotonic_ns())
-        return self.ask(STATUS, request, part)
-
     def sleep(self, seconds: float) -> None:
         """Lets simulated time pass."""
         clock.sleep(seconds)
@@ -236,32 +220,16 @@ class SimulatedSystem:
     def _sleep_in_run(self, until_s: float) -> bool:
         """False if the run has ended before."""
         while not self._ends and (left_s := until_s - clock.monotonic()) > 0:
-            clock.sleep(min(left_s, 1e-9 * 20 * _LOOK_NS))
+            clock.sleep(min(left_s, 20 * _LOOK_S))
             self._check()
         return not self._ends
 
-    def ask(self, service: Service[Any, A], message: Message, source: str = "") -> A:
-        """A request and its answer. InputError without any."""
-        query = self._asked(service, encode(message), source)
-        give_up_s = clock.monotonic() + service.timeout_s
-        while query.answer is None:
-            if clock.monotonic() > give_up_s:
-                raise InputError(f"no answer to '{service.name}' within {service.timeout_s:g} s")
-            self.sleep(_LOOK_NS * 1e-9)
-        return decode(service.answer, query.answer)
-
-    def _asked(self, service: Service[Any, Any], data: bytes, source: str = "") -> Query:
-        try:
-            return self._network.ask(car_key(service.key, self.car, source), data)
-        except KeyError:
-            raise InputError(f"nobody serves '{service.name}'; start the process") from None
-
     # Processes -----------------------------------------------------------------------------------
 
-    def _started_plant(self, session: Session) -> PlantProcess:
+    def _plant_on(self, session: Session) -> PlantProcess:
         return PlantProcess(session, self._plant, self._vehicle, _EPOCH)
 
-    def _started_controller(self, session: Session) -> ControllerProcess:
+    def _controller_on(self, session: Session) -> ControllerProcess:
         if self.controller is not None:
             self.controller.close()
         process = ControllerProcess(session, self._controller, self._make_controller())

@@ -229,7 +229,9 @@ static void step(controller *c, int count, int own_reference, double budget) {
     if (count == 2) {
         CHECK(status[0] == status[1] && memcmp(u[0], u[1], sizeof u[0]) == 0);
         CHECK(info[0].iterations == info[1].iterations && info[0].shifts == info[1].shifts);
-        CHECK(info[0].pace == info[1].pace && info[0].widening == info[1].widening);
+        CHECK(info[0].pace == info[1].pace);
+        /* Where the state was refused, what a preparation has found already is reported. */
+        CHECK(info[0].widening == info[1].widening || status[0] == BR_BAD_STATE);
     }
     if (status[0] > BR_ACCEPTABLE || br_mpc_predict(c[0].mpc, x, u[0], BR_TS, x) != BR_OK) {
         const double start[BR_NX] = {RADIUS_M, 0, 1.5707963267948966, 1.5, 0, 0, 0};

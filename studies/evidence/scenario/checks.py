@@ -12,7 +12,7 @@ from bayesrace.arrays import Floats
 from bayesrace.columns import Columns, LogColumns
 from bayesrace.messages import EVENT, HEARTBEAT, STATE, TELEMETRY, TRUTH, Topic
 from bayesrace.operation.analysis.laps import LapTimes, time_laps, trajectory_digest
-from bayesrace.studies.evidence.scenario.description import Scenario
+from bayesrace.studies.evidence.scenario.description import Holds, Scenario
 from bayesrace.studies.evidence.scenario.events import SensorEvent
 from bayesrace.studies.evidence.verdict import Check
 from bayesrace.tracks import Track
@@ -34,6 +34,13 @@ _WANTED: Final[dict[Topic[Any], str]] = {
     EVENT: "source kind text data",
     HEARTBEAT: "source node counters",
 }
+_AT_MOST: Final = (
+    "off_track_samples", "off_track_m", "lap_s", "lap_over_undisturbed", "fallback_share",
+    "latency_p50_ms", "latency_p99_ms", "unaccounted",
+)  # fmt: skip
+"""What must not be larger than its bound: fields of :class:`Holds` and, but for the comparison of
+two drives, properties of :class:`Drive`. The last part of a name may be its unit."""
+_UNITS: Final = ("m", "s", "ms")
 _TRAFFIC: Final = (
     ("plant", "states_sent", "controller", "states"),
     ("controller", "actuations_sent", "plant", "actuations"),
@@ -58,9 +65,19 @@ class Drive:
         return cls(track, *(columns[one] for one in (TRUTH, STATE, TELEMETRY, EVENT, HEARTBEAT)))
 
     @cached_property
-    def off_track_m(self) -> Floats:
+    def beyond_edge_m(self) -> Floats:
         """Of each true state; negative on the track."""
         return self.track.project_path(self.truth["x"][:, :2]).off_track_m
+
+    @property
+    def off_track_samples(self) -> int:
+        """True states off the track."""
+        return int((self.beyond_edge_m > 0).sum())
+
+    @property
+    def off_track_m(self) -> float:
+        """How far off the track it was at most; 0 if never."""
+        return max(float(self.beyond_edge_m.max()), 0.0)
 
     @cached_property
     def laps(self) -> LapTimes:
@@ -79,9 +96,9 @@ class Drive:
         return np.abs(np.asarray(self.truth["x"], dtype=np.float64)[:, 3])
 
     @property
-    def flying_s(self) -> tuple[float, ...]:
-        """Lap times but for the first."""
-        return self.laps.times_s[1:]
+    def lap_s(self) -> float:
+        """Slowest lap but for the first; NaN without any."""
+        return max(self.laps.times_s[1:], default=np.nan)
 
     @property
     def ended(self) -> dict[str, Any]:
@@ -93,12 +110,9 @@ class Drive:
     def level(self) -> Floats:
         """Fallback level at each true state: of the cycle that answered it first, or of one before,
         whose input is held; NaN where none has answered for a while."""
-        cycles = zip(
-            self.cycles["state_seq"].tolist(), self.cycles["fallback"].tolist(), strict=True
-        )
-        found: dict[int, int] = {}
-        for seq, level in cycles:
-            found.setdefault(seq, level)
+        seqs, levels_of = self.cycles["state_seq"].tolist(), self.cycles["fallback"].tolist()
+        # The first answer to a state stays: it overwrites those after it.
+        found = dict(zip(reversed(seqs), reversed(levels_of), strict=True))
         held, since_s, levels = np.nan, -np.inf, list[float]()
         for seq, time_s in zip(self.truth["seq"].tolist(), self.time_s.tolist(), strict=True):
             if seq in found:
@@ -111,10 +125,19 @@ class Drive:
         """Of all cycles."""
         return float(np.mean(self.cycles["fallback"] > 0)) if len(self.cycles) else 1.0
 
-    def latency_ms(self, quantile: float) -> float:
-        """From a state to the arrival of the actuation that answers it; NaN without any."""
+    @property
+    def latency_p50_ms(self) -> float:
+        """From a state to the arrival of the actuation that answers it, median; NaN without any."""
+        return self._latency_ms(0.5)
+
+    @property
+    def latency_p99_ms(self) -> float:
+        """The same, 99 % of them."""
+        return self._latency_ms(0.99)
+
+    def _latency_ms(self, quantile: float) -> float:
         delays = [row for one in self.states["actuation_delays"] for row in one[1::3]]
-        return 1e3 * float(np.quantile(delays, quantile)) if delays else float("nan")
+        return 1e3 * float(np.quantile(delays, quantile)) if delays else np.nan
 
     def first_fault(self, since_s: float) -> tuple[float, str] | None:
         """When, and of which kind, a fault was found first from then on."""
@@ -158,83 +181,77 @@ class Drive:
         return trajectory_digest(np.asarray(self.truth["x"]), LapTimes((), (), None))
 
 
-def judged(scenario: Scenario, drive: Drive, undisturbed: Drive | None) -> list[Check]:
-    """What must hold, each as a check. ``undisturbed``: where laps are compared with it."""
-    if not len(drive.truth):
-        return [Check(scenario.name, "drives", False, "there is no state of the run")]
-    judge = _Judge(scenario, drive, undisturbed)
-    return [Check(scenario.name, *one) for one in (*judge.driven(), *judge.events(), *judge.end())]
-
-
 _Found = tuple[str, bool, str]
 """What must hold, whether it does, and what was found."""
 
 
-def _most(name: str, bound: float | None, value: float, unit: str = "") -> Iterator[_Found]:
-    if bound is not None:  # NaN does not hold
-        yield f"{name}: at most {bound:g}{unit}", value <= bound, f"{value:.4g}{unit}"
+def judged(scenario: Scenario, drive: Drive, undisturbed: Drive | None) -> list[Check]:
+    """What must hold, each as a check. ``undisturbed``: where laps are compared with it."""
+    if not len(drive.truth):
+        return [Check(scenario.name, "drives", False, "there is no state of the run")]
+    parts = (
+        _bounded(scenario.holds, drive, undisturbed),
+        _ended(scenario.holds, drive),
+        _detected(scenario, drive),
+        _drives_on(scenario, drive),
+    )
+    return [Check(scenario.name, *found) for part in parts for found in part]
 
 
-class _Judge:
-    def __init__(self, scenario: Scenario, drive: Drive, undisturbed: Drive | None) -> None:
-        self._scenario, self._holds = scenario, scenario.holds
-        self._drive, self._undisturbed = drive, undisturbed
+def _bounded(holds: Holds, drive: Drive, undisturbed: Drive | None) -> Iterator[_Found]:
+    for field in _AT_MOST:
+        if (bound := getattr(holds, field)) is None:
+            continue
+        if field != "lap_over_undisturbed":
+            value = getattr(drive, field)
+        else:
+            value = drive.lap_s / undisturbed.lap_s if undisturbed else np.nan
+        *words, last = field.split("_")
+        unit = f" {last}" if last in _UNITS else ""
+        name = " ".join(words if unit else [*words, last])
+        holds_it = bool(value <= bound)  # NaN does not
+        yield f"{name}: at most {bound:g}{unit}", holds_it, f"{value:.4g}{unit}"
 
-    def driven(self) -> Iterator[_Found]:
-        """How the car was driven."""
-        holds, drive = self._holds, self._drive
-        off = drive.off_track_m
-        yield from _most("samples off the track", holds.off_track_samples, int((off > 0).sum()))
-        yield from _most("off the track", holds.off_track_m, max(float(off.max()), 0.0), " m")
-        if holds.laps is not None:
-            count = len(drive.laps.times_s)
-            yield f"laps: at least {holds.laps}", count >= holds.laps, f"{count}"
-        slowest_s = max(drive.flying_s, default=float("nan"))
-        yield from _most("slowest flying lap", holds.lap_s, slowest_s, " s")
-        if self._undisturbed is not None:
-            ratio = slowest_s / max(self._undisturbed.flying_s, default=float("nan"))
-            yield from _most("lap over undisturbed", holds.lap_over_undisturbed, ratio)
-        yield from _most("share of fallback", holds.fallback_share, drive.fallback_share)
 
-    def events(self) -> Iterator[_Found]:
-        """What follows upon what happened."""
-        holds, drive, kinds = self._holds, self._drive, self._drive.events["kind"].tolist()
-        for kind in holds.happens:
-            yield f"event {kind}", kind in kinds, f"{kinds.count(kind)} times"
-        for kind in holds.happens_not:
-            yield f"no event {kind}", kind not in kinds, f"{kinds.count(kind)} times"
-        if holds.detected_within_s is not None or holds.detected is not None:
-            yield from self._detected()
-        if (within_s := holds.drives_on_within_s) is not None:
-            over_s = max(one.settled_s for one in self._scenario.event)
-            again_s = drive.drives_from(over_s)
-            soon = again_s is not None and again_s - over_s <= within_s + _ROUNDING_S
-            found = "never" if again_s is None else f"after {again_s - over_s:.2f} s"
-            yield f"drives on within {within_s:g} s", soon, found
+def _ended(holds: Holds, drive: Drive) -> Iterator[_Found]:
+    """Where it led to, and what is in the log."""
+    if holds.laps is not None:
+        count = len(drive.laps.times_s)
+        yield f"laps: at least {holds.laps}", count >= holds.laps, f"{count}"
+    if holds.stands is not None:
+        name = "stands at the end" if holds.stands else "does not stand at the end"
+        yield name, drive.stands == holds.stands, f"{drive.speed_mps[-1]:.2f} m/s"
+    if holds.ends is not None:
+        reason = str(drive.ended.get("reason", "no end"))
+        yield f"ends by {holds.ends}", reason == holds.ends, reason
+    kinds = drive.events["kind"].tolist()
+    for kind in holds.happens:
+        yield f"event {kind}", kind in kinds, f"{kinds.count(kind)} times"
+    for kind in holds.happens_not:
+        yield f"no event {kind}", kind not in kinds, f"{kinds.count(kind)} times"
 
-    def _detected(self) -> Iterator[_Found]:
-        holds = self._holds
-        began_s = min(o.at_s for o in self._scenario.event if isinstance(o, SensorEvent))
-        first = self._drive.first_fault(began_s)
-        found = "nothing" if first is None else f"{first[1]} after {first[0] - began_s:.2f} s"
-        if (within_s := holds.detected_within_s) is not None:
-            intime = first is not None and first[0] - began_s <= within_s + _ROUNDING_S
-            yield f"fault found within {within_s:g} s", intime, found
-        if holds.detected is not None:
-            known = first is not None and first[1] in holds.detected
-            yield f"fault found: {' or '.join(holds.detected)}", known, found
 
-    def end(self) -> Iterator[_Found]:
-        """Where it led to, and what the messages say."""
-        holds, drive = self._holds, self._drive
-        if holds.stands is not None:
-            name = "stands at the end" if holds.stands else "does not stand at the end"
-            yield name, drive.stands == holds.stands, f"{drive.speed_mps[-1]:.2f} m/s"
-        for share, bound in ((0.5, holds.latency_p50_ms), (0.99, holds.latency_p99_ms)):
-            name = f"state to actuation, {100 * share:g} %"
-            yield from _most(name, bound, drive.latency_ms(share), " ms")
-        if holds.unaccounted is not None:
-            yield from _most("messages unaccounted for", holds.unaccounted, drive.unaccounted)
-        if holds.ends is not None:
-            reason = str(drive.ended.get("reason", "no end"))
-            yield f"ends by {holds.ends}", reason == holds.ends, reason
+def _detected(scenario: Scenario, drive: Drive) -> Iterator[_Found]:
+    """Whether a fault was found, when, and which."""
+    within_s, kinds = scenario.holds.detected_within_s, scenario.holds.detected
+    if within_s is None and kinds is None:
+        return
+    began_s = min(o.at_s for o in scenario.event if isinstance(o, SensorEvent))
+    time_s, kind = drive.first_fault(began_s) or (np.inf, "")
+    found = f"{kind} after {time_s - began_s:.2f} s" if kind else "nothing"
+    if within_s is not None:
+        in_time = time_s - began_s <= within_s + _ROUNDING_S
+        yield f"fault found within {within_s:g} s", in_time, found
+    if kinds is not None:
+        yield f"fault found: {' or '.join(kinds)}", kind in kinds, found
+
+
+def _drives_on(scenario: Scenario, drive: Drive) -> Iterator[_Found]:
+    """Whether solutions drive again after what happened."""
+    if (within_s := scenario.holds.drives_on_within_s) is None:
+        return
+    over_s = max(one.settled_s for one in scenario.event)
+    again_s = drive.drives_from(over_s)
+    soon = again_s is not None and again_s - over_s <= within_s + _ROUNDING_S
+    found = "never" if again_s is None else f"after {again_s - over_s:.2f} s"
+    yield f"drives on within {within_s:g} s", soon, found

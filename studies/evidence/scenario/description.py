@@ -1,6 +1,6 @@
 """The TOML file of a scenario: car, track and controller, what happens, and what must hold."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, Self
 
@@ -14,6 +14,7 @@ from bayesrace.operation.settings import PreparationSettings
 from bayesrace.plant.faults import SensorFaults
 from bayesrace.plant.world import World
 from bayesrace.studies.evidence.scenario.events import (
+    KINDS,
     Event,
     SensorEvent,
     WeightsEvent,
@@ -26,12 +27,6 @@ __all__ = ["KINDS", "Holds", "Scenario", "read_scenario", "shipped"]
 
 _SHIPPED: Final = Path(__file__).parent / "shipped"
 _REMEDY: Final = "docs/scenarios.md shows one; 'bayesrace scenario --list' names those that ship"
-
-KINDS: Final = (
-    "link", "partition", "pause", "kill", "stop", "go", "rollback", "weights", "sensor", "grip",
-    "mass", "motor",
-)  # fmt: skip
-"""Of events."""
 
 _CONTROL: Final = {"rate_hz", "budget", "hold", "sensor_tolerance"}
 
@@ -199,16 +194,11 @@ def _put(content: Any, place: str, value: Any) -> None:
     for part in outer:
         if isinstance(inner, dict):
             inner = inner.setdefault(part, {})
+        elif isinstance(inner, list) and part.isdecimal() and int(part) < len(inner):
+            inner = inner[int(part)]
         else:
-            inner = inner[_index(place, part, inner)]
-    if isinstance(inner, dict):
-        inner[last] = value
-    else:
+            there = f"0 to {len(inner) - 1}" if isinstance(inner, list) and inner else "none"
+            raise InputError(f"'{place}': there is no '{part}'; there are {there}")
+    if not isinstance(inner, dict):
         raise InputError(f"'{place}' names no value: write it as event.0.delay_ms")
-
-
-def _index(place: str, part: str, among: Sequence[Any]) -> int:
-    if isinstance(among, list) and part.isdecimal() and int(part) < len(among):
-        return int(part)
-    there = f"0 to {len(among) - 1}" if isinstance(among, list) and among else "none"
-    raise InputError(f"'{place}': there is no '{part}'; there are {there}")
+    inner[last] = value

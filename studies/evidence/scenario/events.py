@@ -1,56 +1,25 @@
 """What can happen in a scenario: rows ``[[event]]``, each with its moment and how long it lasts."""
 
-from collections.abc import Callable, Iterable, Iterator
-from pathlib import Path
-from typing import Annotated, Any, Literal, Protocol, Self
+from collections.abc import Callable, Iterable
+from functools import partial
+from typing import Annotated, Any, Final, Literal, Self, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from bayesrace.operation.simulation.system import Part
+from bayesrace.operation.driving_system import DrivingSystem, Part
 from bayesrace.plant.faults import SensorFault
 from bayesrace.plant.world import Change, What
 from bayesrace.tracks import Track
 from bayesrace.transport.relay import Link
 
-__all__ = ["Event", "System", "timeline"]
+__all__ = ["KINDS", "Event", "timeline"]
 
-_FOREVER_S = 1e6
+_FOREVER_S: Final = 1e6
+
+FindWeights = Callable[[str], Any]
+"""The content of the weights of that name."""
 
 Receiver = Literal["plant", "controller", "both"]
-
-
-class System(Protocol):
-    """A plant and a controller that drive, as what happens acts on them."""
-
-    def set_link(self, to: Part, link: Link) -> None:
-        """What happens to messages for that process."""
-
-    def hold(self, to: Part) -> None:
-        """No message gets there any more."""
-
-    def release(self, to: Part) -> None:
-        """The end of that."""
-
-    def pause(self, part: Part, seconds: float) -> None:
-        """The process does not run for so long (SIGSTOP)."""
-
-    def kill(self) -> None:
-        """The controller ends at once (SIGKILL)."""
-
-    def restart(self) -> None:
-        """A new controller is started."""
-
-    def stop(self) -> object:
-        """The controller is told to stop the car."""
-
-    def go(self) -> object:
-        """And to drive again."""
-
-    def publish(self, weights: Path) -> object:
-        """New weights for the controller; whether it takes them is an event of its own."""
-
-    def roll_back(self) -> object:
-        """Back to the weights before."""
 
 
 class _Event(BaseModel):
@@ -77,11 +46,11 @@ class _Event(BaseModel):
         said = [getattr(self, "kind", ""), *(f"{k} {v}" for k, v in values.items())]
         return ", ".join(said) + (f", for {lasts_s:g} s" if lasts_s else "")
 
-    def begin(self, system: System, weights: Callable[[str], Path]) -> object:
+    def begin(self, system: DrivingSystem, weights: FindWeights) -> object:
         """Makes it happen; ``weights`` finds those of a name. Nothing where the plant itself was
         started with it."""
 
-    def end(self, system: System) -> object:
+    def end(self, system: DrivingSystem) -> object:
         """Ends it."""
 
 
@@ -95,7 +64,7 @@ class _OnLink(_Lasting):
     @property
     def ways(self) -> tuple[Part, ...]:
         """By who receives."""
-        return ("plant", "controller") if self.to == "both" else (self.to,)
+        return get_args(Part) if self.to == "both" else (self.to,)
 
 
 class LinkEvent(_OnLink):
@@ -111,13 +80,13 @@ class LinkEvent(_OnLink):
         "as TCP: it comes later and holds up what follows. In real time of the whole drive",
     )
 
-    def begin(self, system: System, weights: Callable[[str], Path]) -> None:
+    def begin(self, system: DrivingSystem, weights: FindWeights) -> None:
         """Both ways have the same numbers."""
         link = Link(1e-3 * self.delay_ms, 1e-3 * self.jitter_ms, self.loss, not self.reordered)
         for way in self.ways:
             system.set_link(way, link)
 
-    def end(self, system: System) -> None:
+    def end(self, system: DrivingSystem) -> None:
         """A perfect link."""
         for way in self.ways:
             system.set_link(way, Link(ordered=not self.reordered))
@@ -128,12 +97,12 @@ class PartitionEvent(_OnLink):
 
     kind: Literal["partition"]
 
-    def begin(self, system: System, weights: Callable[[str], Path]) -> None:
+    def begin(self, system: DrivingSystem, weights: FindWeights) -> None:
         """One way or both."""
         for way in self.ways:
             system.hold(way)
 
-    def end(self, system: System) -> None:
+    def end(self, system: DrivingSystem) -> None:
         """What has waited arrives."""
         for way in self.ways:
             system.release(way)
@@ -146,7 +115,7 @@ class PauseEvent(_Event):
     process: Part = Field(description="plant or controller")
     for_s: float = Field(gt=0, le=60, description="how long [s]")
 
-    def begin(self, system: System, weights: Callable[[str], Path]) -> None:
+    def begin(self, system: DrivingSystem, weights: FindWeights) -> None:
         """It goes on by itself."""
         system.pause(self.process, self.for_s)
 
@@ -156,13 +125,13 @@ class KillEvent(_Lasting):
 
     kind: Literal["kill"]
 
-    def begin(self, system: System, weights: Callable[[str], Path]) -> None:
+    def begin(self, system: DrivingSystem, weights: FindWeights) -> None:
         """SIGKILL."""
         system.kill()
 
-    def end(self, system: System) -> None:
+    def end(self, system: DrivingSystem) -> None:
         """As it was started first."""
-        system.restart()
+        system.start()
 
 
 class CommandEvent(_Event):
@@ -170,7 +139,7 @@ class CommandEvent(_Event):
 
     kind: Literal["stop", "go", "rollback"]
 
-    def begin(self, system: System, weights: Callable[[str], Path]) -> object:
+    def begin(self, system: DrivingSystem, weights: FindWeights) -> object:
         """As ``bayesrace stop``, ``go`` and ``rollback``."""
         commands = {"stop": system.stop, "go": system.go, "rollback": system.roll_back}
         return commands[self.kind]()
@@ -182,7 +151,7 @@ class WeightsEvent(_Event):
     kind: Literal["weights"]
     weights: str = Field(description="learned, updated, or a file")
 
-    def begin(self, system: System, weights: Callable[[str], Path]) -> object:
+    def begin(self, system: DrivingSystem, weights: FindWeights) -> object:
         """As ``bayesrace publish``."""
         return system.publish(weights(self.weights))
 
@@ -242,14 +211,21 @@ Event = Annotated[
 ]  # fmt: skip
 """A row, by its ``kind``."""
 
+KINDS: Final[tuple[str, ...]] = tuple(
+    kind
+    for event in get_args(get_args(Event)[0])
+    for kind in get_args(event.model_fields["kind"].annotation)
+)
+"""Of events."""
+
 
 def timeline(
-    events: Iterable[Event], weights: Callable[[str], Path]
-) -> Iterator[tuple[float, Callable[[System], object]]]:
+    events: Iterable[Event], weights: FindWeights
+) -> list[tuple[float, Callable[[DrivingSystem], object]]]:
     """When what is done to the system, in this order."""
-    steps = list[tuple[float, Callable[[System], object]]]()
+    steps: list[tuple[float, Callable[[DrivingSystem], object]]] = []
     for one in events:
-        steps.append((one.at_s, lambda system, one=one: one.begin(system, weights)))  # type: ignore[misc]
+        steps.append((one.at_s, partial(one.begin, weights=weights)))
         if one.at_s < one.end_s < _FOREVER_S:
-            steps.append((one.end_s, lambda system, one=one: one.end(system)))  # type: ignore[misc]
-    yield from sorted(steps, key=lambda step: step[0])
+            steps.append((one.end_s, one.end))
+    return sorted(steps, key=lambda step: step[0])

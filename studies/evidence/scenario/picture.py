@@ -22,7 +22,7 @@ def drive_picture(scenario: Scenario, drive: Drive) -> Figure:
     draw_edges(on_track, right, left)
     show_all(on_track, np.concatenate([right, left]))
     on_track.set_axis_off()
-    xy, fallback, off = drive.truth["x"][:, :2], drive.level > 0, drive.off_track_m > 0
+    xy, fallback, off = drive.truth["x"][:, :2], drive.level > 0, drive.beyond_edge_m > 0
     on_track.plot(xy[:, 0], xy[:, 1], color=_DRIVEN, linewidth=0.7)
     on_track.plot(*xy[fallback].T, ".", color="#D55E00", markersize=2)
     on_track.plot(*xy[off].T, ".", color=WARNING, markersize=3)

@@ -7,6 +7,7 @@ from typing import Any
 from bayesrace.controller.assembly import compiled_controller
 from bayesrace.controller.process_settings import ControllerSettings
 from bayesrace.errors import InputError
+from bayesrace.files import read_whole
 from bayesrace.operation.closed_loop import ClosedLoop, built_in_car
 from bayesrace.operation.preparation import Prepared, prepare, updated_weights
 from bayesrace.operation.run_plan import RunPlan
@@ -29,9 +30,9 @@ class Ready:
     prepared: Prepared
     named: dict[str, Path]
 
-    def weights(self, name: str) -> Path:
-        """File of the weights of that name."""
-        return self.named[name]
+    def weights(self, name: str) -> bytes:
+        """Content of the weights of that name."""
+        return read_whole(self.named[name], "the weights")
 
     @property
     def first_weights(self) -> Path | None:

@@ -5,65 +5,58 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
-from bayesrace.configuration import Configuration, configured
-from bayesrace.files import read_whole, write_whole
-from bayesrace.messages import COMMAND, EVENT, STATUS, Command, Event, StatusRequest
+from bayesrace.configuration import configured
+from bayesrace.files import write_whole
+from bayesrace.messages import EVENT, Event, Message, Service
 from bayesrace.operation.drive import execute
-from bayesrace.operation.simulation.system import Part
+from bayesrace.operation.driving_system import DrivingSystem, Part
+from bayesrace.operation.race import plant_options
 from bayesrace.operation.system import CONFIGURATION, child, private_network, started_system
 from bayesrace.plant.faults import write_sensor_faults
-from bayesrace.plant.world import write_world
 from bayesrace.recorder import Recorder
-from bayesrace.sensors import write_sensors
 from bayesrace.studies.evidence.scenario.events import LinkEvent, PartitionEvent, timeline
 from bayesrace.studies.evidence.scenario.preparing import Ready
 from bayesrace.studies.evidence.scenario.simulated import SETTLING_S
-from bayesrace.transport import (
-    Director,
-    Publisher,
-    ask,
-    free_endpoint,
-    open_session,
-    send_rollback,
-    send_weights,
-)
+from bayesrace.transport import Director, Publisher, ask, free_endpoint, open_session
 from bayesrace.transport.relay import Link, Relay
 from bayesrace.vehicles import car_text, write_car
 
 __all__ = ["drive_real"]
 
+A = TypeVar("A", bound=Message)
+
 _LOOK_S: Final = 0.005
-_REASON: Final = "a scenario"
 _WAYS: Final = {"controller": "forth", "plant": "back"}
 """Of the relay, whose target is the plant, by who receives."""
 
 
-class _Processes:
-    """Processes as :class:`.events.System`, over a session of its own."""
+class _Processes(DrivingSystem):
+    """Processes in real time, over a session of the time line's own."""
 
     def __init__(self, session: Any, car: str) -> None:
         self._session, self._car = session, car
         self.relay: Relay | None = None
+        """There is one where an event is of the link."""
         self.pids: dict[str, int] = {}
-        self.start_controller: Any = None
-
-    def _link(self) -> Relay:
-        assert self.relay is not None  # noqa: S101 (there is one where a link event is)
-        return self.relay
+        self.start_controller: Callable[[], int] | None = None
 
     def set_link(self, to: Part, link: Link) -> None:
-        self._link().set_way(_WAYS[to], link)
+        if self.relay is not None:
+            self.relay.set_way(_WAYS[to], link)
 
     def hold(self, to: Part) -> None:
-        self._link().hold(_WAYS[to])
+        if self.relay is not None:
+            self.relay.hold(_WAYS[to])
 
     def release(self, to: Part) -> None:
-        self._link().release(_WAYS[to])
+        if self.relay is not None:
+            self.relay.release(_WAYS[to])
 
     def pause(self, part: Part, seconds: float) -> None:
         os.kill(self.pids[part], signal.SIGSTOP)
@@ -74,60 +67,24 @@ class _Processes:
     def kill(self) -> None:
         os.kill(self.pids["controller"], signal.SIGKILL)
 
-    def restart(self) -> None:
-        self.pids["controller"] = self.start_controller()
+    def start(self) -> None:
+        if self.start_controller is not None:
+            self.pids["controller"] = self.start_controller()
 
-    def stop(self) -> object:
-        return self._command("stop")
-
-    def go(self) -> object:
-        return self._command("go")
-
-    def _command(self, command: str) -> object:
-        now_ns = time.monotonic_ns()
-        request = Command(seq=0, source_time_ns=now_ns, command=command, text=_REASON)
-        return ask(self._session, COMMAND, self._car, request)
-
-    def publish(self, weights: Path) -> object:
-        return send_weights(self._session, self._car, read_whole(weights, "the weights"))
-
-    def roll_back(self) -> object:
-        return send_rollback(self._session, self._car, _REASON)
-
-    @property
-    def running(self) -> bool:
-        """Whether the run has begun."""
-        request = StatusRequest(seq=0, source_time_ns=time.monotonic_ns())
-        return ask(self._session, STATUS, self._car, request, "plant").phase == "running"
+    def ask(self, service: Service[Any, A], request: Message | bytes, source: str = "") -> A:
+        return ask(self._session, service, self._car, request, source)
 
 
-class _Timeline(threading.Thread):
-    """Lets happen what happens, from the start of the run on."""
-
-    def __init__(self, ready: Ready, processes: _Processes) -> None:
-        super().__init__(daemon=True)
-        self._ready, self._processes = ready, processes
-        self._over = threading.Event()
-        self.error: Exception | None = None
-
-    def run(self) -> None:
-        try:
-            while not self._over.wait(_LOOK_S) and not self._processes.running:
-                pass
-            begin_s, acted_on = time.monotonic(), self._processes
-            for at_s, act in timeline(self._ready.scenario.event, self._ready.weights):
-                if self._over.wait(max(begin_s + at_s - time.monotonic(), 0.0)):
-                    return
-                act(acted_on)
-        except Exception as error:
-            self.error = error
-
-    def finish(self) -> None:
-        """Ends it; raises what went wrong."""
-        self._over.set()
-        self.join(30.0)
-        if self.error is not None:
-            raise self.error
+def _let_happen(ready: Ready, processes: _Processes, over: threading.Event) -> None:
+    """What happens, from the start of the run on; in a thread of its own."""
+    while processes.status("plant").phase != "running":
+        if over.wait(_LOOK_S):
+            return
+    begin_s = time.monotonic()
+    for at_s, act in timeline(ready.scenario.event, ready.weights):
+        if over.wait(max(begin_s + at_s - time.monotonic(), 0.0)):
+            return
+        act(processes)
 
 
 def drive_real(ready: Ready, folder: Path) -> None:
@@ -143,12 +100,14 @@ def drive_real(ready: Ready, folder: Path) -> None:
         director = Director(session, car.name)
         director.wait_for(("plant", "controller"), 60.0)
         with Recorder(session, car.name, folder / "run.mcap", about) as recorder:
-            happening = _Timeline(ready, processes)
-            happening.start()
-            try:
-                execute(director, events, first.track, ready.plan, recorder)
-            finally:
-                happening.finish()
+            over = threading.Event()
+            with ThreadPoolExecutor(1) as beside:
+                happening = beside.submit(_let_happen, ready, processes, over)
+                try:
+                    execute(director, events, first.track, ready.plan, recorder)
+                finally:
+                    over.set()
+            happening.result()
             time.sleep(SETTLING_S)
 
 
@@ -178,7 +137,8 @@ def _started(ready: Ready, folder: Path) -> Iterator[tuple[Any, _Processes]]:
             controller += ["--endpoint", relay.endpoint]
         system = stack.enter_context(started_system(name, folder, plant, configuration=network))
         stack.enter_context(system.controller(controller))
-        processes = _Processes(_looking_on(stack, network), name)
+        beside = open_session(network.endpoints("director"), "director")
+        processes = _Processes(stack.enter_context(beside), name)
         processes.relay = relay
         processes.pids = {part: one.pid for part, one in system.children.items()}
         again = ["--config", str(folder / CONFIGURATION), "--parent-pid", str(os.getpid())]
@@ -190,30 +150,17 @@ def _started(ready: Ready, folder: Path) -> Iterator[tuple[Any, _Processes]]:
         yield system.session, processes
 
 
-def _looking_on(stack: ExitStack, network: Configuration) -> Any:
-    """A session for the thread of the time line."""
-    return stack.enter_context(open_session(network.endpoints("director"), "director"))
-
-
 def _plant_options(ready: Ready, folder: Path) -> list[str]:
-    settings = ready.plant
-    pairs: list[tuple[str, object]] = [
-        ("--car", folder / "car.toml"), ("--rate", settings.rate_hz), ("--seed", settings.seed),
-        ("--simulator", settings.simulator), ("--delay", 1e3 * settings.delay_s),
-        ("--buffer", 1e3 * settings.buffer_s),
-        ("--sensors", folder / "sensors.toml" if settings.instruments.root else "exact"),
-    ]  # fmt: skip
+    settings, faults = ready.plant, folder / "faults.toml"
     write_car(folder / "car.toml", settings.car)
-    if settings.instruments.root:
-        write_sensors(folder / "sensors.toml", settings.instruments)
-    if settings.changes.root:
-        write_world(folder / "world.toml", settings.changes)
-        pairs.append(("--world", folder / "world.toml"))
+    race = ready.scenario.race.model_copy(update={"world": settings.world})
+    pairs: list[tuple[str, object]] = [
+        ("--rate", settings.rate_hz), ("--buffer", 1e3 * settings.buffer_s),
+    ]  # fmt: skip
     if settings.faults:
-        write_sensor_faults(folder / "faults.toml", ready.scenario.faults)
-        pairs.append(("--sensor-faults", folder / "faults.toml"))
-    pairs += [(o, f) for o, f in (("--fmu", settings.fmu), ("--map", settings.fmu_map)) if f]
-    return [str(one) for pair in pairs for one in pair]
+        write_sensor_faults(faults, ready.scenario.faults)
+        pairs.append(("--sensor-faults", faults))
+    return [*plant_options(race, folder), *(str(one) for pair in pairs for one in pair)]
 
 
 def _controller_options(ready: Ready, folder: Path) -> list[str]:

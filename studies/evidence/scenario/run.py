@@ -3,10 +3,11 @@ one after the other. A campaign's grid is one scenario many times."""
 
 import itertools
 import json
+import math
 import multiprocessing
 import time
-from collections.abc import Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any
 
@@ -52,32 +53,41 @@ def verdict_of(results: Sequence[Result]) -> Verdict:
 
 
 def run_scenarios(
-    scenarios: Sequence[Scenario], out: Path | None, stages: Stages, workers: int = 0
+    scenarios: Sequence[Scenario],
+    out: Path | None,
+    stages: Stages,
+    workers: int = 0,
+    ended: Callable[[Result], None] = lambda _: None,
 ) -> list[Result]:
     """The results, in the order of the scenarios. ``out``: keeps the recordings, in a folder of the
     scenario's name; ``workers``: 0 for one a processor.
 
-    InputError for what cannot be prepared. A drive that cannot be driven to its end is a check that
-    fails.
+    ``ended`` is called with each as it ends. InputError for what cannot be prepared. A drive that
+    cannot be driven to its end is a check that fails.
     """
     # Once, before several look for it in the cache.
     for one in {_prepared_by(one): one for one in scenarios}.values():
         make_ready(one, stages)
-    simulated = [one for one in scenarios if one.mode == "simulated"]
     results = dict[str, Result]()
-    count = min(workers or multiprocessing.cpu_count(), len(simulated))
     with stages.stage(f"drive {len(scenarios)} scenarios") as stage:
-        if count > 1:
-            spawn = multiprocessing.get_context("spawn")  # the parent has threads
-            with ProcessPoolExecutor(count, spawn) as pool:
-                for result in pool.map(_driven, simulated, itertools.repeat(out)):
-                    results[result.name] = result
-                    stage.update(len(results) / len(scenarios), result.name)
-        for one in scenarios:
-            if one.name not in results:
-                results[one.name] = _driven(one, out)
-                stage.update(len(results) / len(scenarios), one.name)
+        for result in _each_driven(scenarios, out, workers):
+            results[result.name] = result
+            stage.update(len(results) / len(scenarios), result.name)
+            ended(result)
     return [results[one.name] for one in scenarios]
+
+
+def _each_driven(scenarios: Sequence[Scenario], out: Path | None, workers: int) -> Iterator[Result]:
+    """As they end."""
+    simulated = [one for one in scenarios if one.mode == "simulated"]
+    count = min(workers or multiprocessing.cpu_count(), len(simulated))
+    if count > 1:
+        spawn = multiprocessing.get_context("spawn")  # the parent has threads
+        with ProcessPoolExecutor(count, spawn) as pool:
+            driven = [pool.submit(_driven, one, out) for one in simulated]
+            yield from (one.result() for one in as_completed(driven))
+        scenarios = [one for one in scenarios if one.mode != "simulated"]
+    yield from (_driven(one, out) for one in scenarios)
 
 
 def _prepared_by(scenario: Scenario) -> str:
@@ -87,6 +97,7 @@ def _prepared_by(scenario: Scenario) -> str:
 
 def _driven(scenario: Scenario, out: Path | None) -> Result:
     begun = time.perf_counter()
+    known: dict[str, Any] = {}
     with temporary_folder() as scratch, stages_on(Console(quiet=True)) as stages:
         folder = scratch if out is None else out / scenario.name
         folder.mkdir(parents=True, exist_ok=True)
@@ -97,13 +108,13 @@ def _driven(scenario: Scenario, out: Path | None) -> Result:
             alone = Ready(scenario.undisturbed, ready.prepared, ready.named)
             undisturbed = _recorded(alone, folder / "undisturbed") if compared else None
         except InputError as error:
-            failed = (Check(scenario.name, "drives to its end", False, str(error)),)
-            seconds = time.perf_counter() - begun
-            return Result(
-                name=scenario.name, scenario=scenario, passed=False, checks=failed, seconds=seconds
-            )
-    checks = tuple(judged(scenario, drive, undisturbed))
-    return _result(scenario, drive, checks, time.perf_counter() - begun)
+            checks = [Check(scenario.name, "drives to its end", False, str(error))]
+        else:
+            checks, known = judged(scenario, drive, undisturbed), _numbers(scenario, drive)
+    return Result(
+        name=scenario.name, scenario=scenario, passed=all(one.passed for one in checks),
+        checks=tuple(checks), seconds=time.perf_counter() - begun, **known,
+    )  # fmt: skip
 
 
 def _recorded(ready: Ready, folder: Path) -> Drive:
@@ -116,25 +127,20 @@ def _recorded(ready: Ready, folder: Path) -> Drive:
     return Drive.read(folder / "run.mcap", ready.prepared.first.track)
 
 
-def _result(scenario: Scenario, drive: Drive, checks: tuple[Check, ...], seconds: float) -> Result:
-    known: dict[str, Any] = {}
-    if len(drive.truth):
-        off = drive.off_track_m
-        latencies = [drive.latency_ms(share) for share in (0.5, 0.99)]
-        p50, p99 = (None if one != one else one for one in latencies)
-        with figure_style():
-            picture = inline_svg(drive_picture(scenario, drive))
-        known = {
-            "laps_s": drive.laps.times_s, "off_track_samples": int((off > 0).sum()),
-            "off_track_max_m": float(off.max()), "fallback_share": drive.fallback_share,
-            "latency_p50_ms": p50, "latency_p99_ms": p99, "trajectory_sha256": drive.digest,
-            "picture": picture,
-        }  # fmt: skip
-    passed = all(one.passed for one in checks)
-    return Result(
-        name=scenario.name, scenario=scenario, passed=passed, checks=checks, seconds=seconds,
-        **known,
-    )  # fmt: skip
+def _numbers(scenario: Scenario, drive: Drive) -> dict[str, Any]:
+    """Of a result, where something was recorded, and the picture."""
+    if not len(drive.truth):
+        return {}
+    p50_ms, p99_ms = drive.latency_p50_ms, drive.latency_p99_ms
+    with figure_style():
+        picture = inline_svg(drive_picture(scenario, drive))
+    return {
+        "laps_s": drive.laps.times_s, "off_track_samples": drive.off_track_samples,
+        "off_track_max_m": float(drive.beyond_edge_m.max()),
+        "fallback_share": drive.fallback_share, "trajectory_sha256": drive.digest,
+        "latency_p50_ms": None if math.isnan(p50_ms) else p50_ms,
+        "latency_p99_ms": None if math.isnan(p99_ms) else p99_ms, "picture": picture,
+    }  # fmt: skip
 
 
 def read_grid(plan: Path, scenario: str | Path) -> list[Scenario]:
