@@ -88,7 +88,7 @@ class _Replay:
             around = cycle.limits(self._driver.vx_mps, slow_down_mps2)
             lockstep = cycle.answered.lockstep
             if lockstep:
-                decision = self._timed.decide(cycle.answered.time_s, environment=around)
+                decision = self._timed.decide(self._driver.time_s, environment=around)
             else:
                 self._driver.repeat(cycle.how.refused)
                 times = cycle.sent.decided_at_s, _BUDGET_S, _BUDGET_S + cycle.how.late_s
