@@ -155,7 +155,7 @@ class Driver:
 
     @property
     def time_s(self) -> float:
-        """Plant time of the newest state, which says another one where it is not believed."""
+        """Plant time of the newest state: its own, or another one where that is not believed."""
         time_s: float = self._counters.time_s
         return time_s
 

@@ -251,6 +251,7 @@ class Controller:
                 )
             )  # fmt: skip
             self._seq += 1
+            time_s = driver.time_s  # not the state's own where that is not believed
         elif self._first:
             raise InputError("state = None: the first step of a run needs a state")
         self._first = False

@@ -6,7 +6,8 @@
  * the controller process.
  *
  *   br_cycle_observe(cycle, &state);                                      a state has arrived
- *   br_cycle_decide(cycle, NULL, state.time_s, budget, 0, &decision);
+ *   now = br_cycle_counters(cycle)->time_s;           its time, or the one that is believed
+ *   br_cycle_decide(cycle, NULL, now, budget, 0, &decision);
  *   (send decision.u)
  *   br_cycle_prepare(cycle, period, budget);              while waiting for the next one
  *

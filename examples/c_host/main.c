@@ -145,7 +145,8 @@ static int answer(host *h, const char *line, char *out, size_t size) {
     h->arrived_s = arrived_s;
     if (final) br_cycle_end(h->cycle);
     const double budget_s = state.lockstep ? 0 : SHARE * h->period_s;
-    if (final || br_cycle_decide(h->cycle, NULL, state.time_s, budget_s, 0, &decision)) return 0;
+    const double now_s = br_cycle_counters(h->cycle)->time_s;
+    if (final || br_cycle_decide(h->cycle, NULL, now_s, budget_s, 0, &decision)) return 0;
     return write_decision(out, size, &decision);
 }
 
@@ -176,7 +177,7 @@ static int bridge(host *h, char *out, size_t size) {
         br_cycle_forget(h->cycle);
     }
     if (!h->driving) return 0;
-    const double decided_at_s = h->newest.time_s + since_s;
+    const double decided_at_s = br_cycle_counters(h->cycle)->time_s + since_s;
     if (br_cycle_decide(h->cycle, NULL, decided_at_s, SHARE * h->period_s, 0, &decision)) return 0;
     return write_decision(out, size, &decision);
 }

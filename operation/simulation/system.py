@@ -168,7 +168,7 @@ class SimulatedSystem(DrivingSystem):
         try:
             query = self._network.ask(car_key(service.key, self.car, source), data)
         except KeyError:
-            raise InputError(f"nobody serves '{service.name}'; start the process") from None
+            raise InputError(f"no process answers '{service.name}'; start it") from None
         adoption = self.controller._adoption if self.controller else None
         judged = service in (WEIGHTS, ROLLBACK)
         now, patience_s = clock.monotonic, service.timeout_s

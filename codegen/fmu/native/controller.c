@@ -222,7 +222,7 @@ fmu_status fmu_model_step(fmu_instance *instance, double h) {
     const br_measured state = measured(instance);
     br_decision decision;
     if (br_cycle_observe(c->cycle, &state) != BR_STATE_NEW ||
-        br_cycle_decide(c->cycle, &around, v[FMU_V_time], 0, 0, &decision))
+        br_cycle_decide(c->cycle, &around, br_cycle_counters(c->cycle)->time_s, 0, 0, &decision))
         return FMU_ERROR(instance, "controller: the control cycle refuses the state");
     set_outputs(instance, &decision);
     return status;

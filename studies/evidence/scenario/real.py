@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any, Final, TypeVar
 
 from bayesrace.configuration import configured
-from bayesrace.files import write_whole
 from bayesrace.messages import EVENT, Event, Message, Service
 from bayesrace.operation.drive import execute
 from bayesrace.operation.driving_system import DrivingSystem, Part
@@ -88,7 +87,8 @@ def _let_happen(ready: Ready, processes: _Processes, over: threading.Event) -> N
 
 
 def drive_real(ready: Ready, folder: Path) -> None:
-    """Leaves ``run.mcap`` and the output of the processes in the folder, and no process.
+    """Leaves ``run.mcap`` and the output of the processes in the folder of ``mpc.json``, and no
+    process.
 
     InputError if a process does not start, or the run ends by anything but its laps or its time.
     """
@@ -165,7 +165,6 @@ def _plant_options(ready: Ready, folder: Path) -> list[str]:
 
 def _controller_options(ready: Ready, folder: Path) -> list[str]:
     settings, prepared = ready.controller, ready.prepared
-    write_whole(folder / "mpc.json", ready.scenario.mpc.model_dump_json(indent=1) + "\n")
     write_car(folder / "driven-car.toml", settings.car)
     pairs: list[tuple[str, object]] = [
         ("--car", folder / "driven-car.toml"), ("--artefact", prepared.artefacts[0]),

@@ -15,7 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from rich.console import Console
 
 from bayesrace.errors import InputError
-from bayesrace.files import parse_toml, read_text, temporary_folder
+from bayesrace.files import parse_toml, read_text, temporary_folder, write_whole
 from bayesrace.operation.report.style import figure_style, inline_svg
 from bayesrace.operation.terminal.terminal import Stages, stages_on
 from bayesrace.studies.evidence.scenario.checks import Drive, judged
@@ -119,6 +119,7 @@ def _driven(scenario: Scenario, out: Path | None) -> Result:
 
 def _recorded(ready: Ready, folder: Path) -> Drive:
     folder.mkdir(exist_ok=True)
+    write_whole(folder / "mpc.json", ready.scenario.mpc.model_dump_json(indent=1) + "\n")
     if ready.scenario.mode == "simulated":
         from bayesrace.studies.evidence.scenario.simulated import drive_simulated as drive
     else:

@@ -5,7 +5,6 @@ from pathlib import Path
 
 from bayesrace.codegen.compiler import compiled
 from bayesrace.controller.assembly import predictive_controller
-from bayesrace.files import write_whole
 from bayesrace.log import LogWriter
 from bayesrace.operation.simulation import SimulatedSystem
 from bayesrace.plant.vehicle import open_vehicle
@@ -19,14 +18,12 @@ SETTLING_S = 1.5
 
 
 def drive_simulated(ready: Ready, folder: Path) -> None:
-    """Leaves ``run.mcap`` in the folder. InputError if the drive cannot be begun, or an event
-    cannot happen."""
+    """Leaves ``run.mcap`` in the folder of ``mpc.json``. InputError if the drive cannot be begun,
+    or an event cannot happen."""
     scenario, plant, first = ready.scenario, ready.plant, ready.prepared.first
-    mpc = folder / "mpc.json"
-    write_whole(mpc, scenario.mpc.model_dump_json(indent=1) + "\n")
     make = partial(
         predictive_controller, ready.prepared.artefacts[0], ready.controller.car,
-        first.track_file, first.line_file, mpc, ready.first_weights,
+        first.track_file, first.line_file, folder / "mpc.json", ready.first_weights,
     )  # fmt: skip
     played = plant.car, plant.fmu, plant.fmu_map, plant.rate_hz, compiled
     log = LogWriter(folder / "run.mcap")
