@@ -139,7 +139,7 @@ typedef struct {
     double cost;             /* objective at the returned plan, slack included */
     double slack_max_m;      /* largest violation of a soft constraint */
     double tube_m;           /* half the width that uncertainty takes of a soft constraint, the
-                              * largest */
+                              * largest; may be infinite */
     double pace;             /* of the reference, as a share of the line's speed; 1 where all is
                               * known */
     double widening;         /* of the residual's standard deviations, noise included, by what is

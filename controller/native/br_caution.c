@@ -169,7 +169,8 @@ void br_caution_update(br_mpc *mpc) {
     br_timer_note(&mpc->timer, begin, &mpc->timer.caution);
 }
 
-/* n standard deviations of the row with this gradient at the end of stage k. */
+/* n standard deviations of the row with this gradient at the end of stage k; infinite where they
+ * are not a number, as with weights whose slopes overflow on their way. */
 static double half_tube(const br_mpc *mpc, int k, int r, const double *gradient) {
     double squares = 0;
     for (int j = 0; j < BR_NE + mpc->caution.begins; ++j) {
@@ -178,7 +179,7 @@ static double half_tube(const br_mpc *mpc, int k, int r, const double *gradient)
             along += gradient[n] * mpc->caution.deviation[k][j][BR_ROW_INDEX[n]];
         squares += along * along;
     }
-    return mpc->parameters.caution_sigmas * sqrt(squares);
+    return squares >= 0 ? mpc->parameters.caution_sigmas * sqrt(squares) : INFINITY;
 }
 
 /* The widest of the rows by stage, of the plan that the step began with. Returns the largest share
@@ -232,9 +233,9 @@ void br_caution_pace(br_mpc *mpc, double elapsed) {
         mpc->info.tube_m = br_worse(mpc->info.tube_m, mpc->answer_tube[k]);
 #if BR_HAS_PATH
     const double excess = worst / BR_CAUTION_SHARE - 1;
-    const double rate = excess <= 0 ? BR_CAUTION_FASTER * fmin(-2 * excess, 1)
-                                    : -fmin(BR_CAUTION_SLOWER * fmin(excess, 1), /* NaN, too */
-                                            fmax(braking_rate(mpc), 0));
+    const double rate =
+        excess <= 0 ? BR_CAUTION_FASTER * fmin(-2 * excess, 1)
+                    : -fmin(BR_CAUTION_SLOWER * fmin(excess, 1), fmax(braking_rate(mpc), 0));
     const double pace = mpc->caution.pace * (1 + rate * fmin(elapsed, BR_TS));
     mpc->caution.pace = fmin(fmax(pace, BR_CAUTION_LEAST), 1);
 #else
