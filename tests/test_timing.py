@@ -1,7 +1,7 @@
 """``bayesrace timing``: its extrapolation against laws that are known, and what it measures."""
 
 import json
-from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +16,7 @@ from bayesrace.operation.preparation import Prepared
 from bayesrace.operation.terminal.terminal import Stages
 from bayesrace.operation.training_drives import PreparedTrack
 from bayesrace.studies.evidence.timing import study
-from bayesrace.studies.evidence.timing.counter import InstructionCounter
+from bayesrace.studies.evidence.timing.instructions import missing
 from bayesrace.studies.evidence.timing.problems import KINDS, Case, Rig, search, work
 from bayesrace.studies.evidence.timing.report import print_study, write_study
 from bayesrace.studies.evidence.timing.settings import TimingSettings
@@ -83,33 +83,26 @@ def prepared(
 
 
 @pytest.fixture
-def counter() -> Iterator[InstructionCounter]:
-    counter = InstructionCounter()
-    yield counter
-    counter.close()
-
-
-@pytest.fixture
-def rig(prepared: Prepared, car: Car, counter: InstructionCounter) -> Rig:
-    return Rig(TimingSettings(car=car, tracks=("peanut",)), prepared, counter)
+def rig(prepared: Prepared, car: Car) -> Rig:
+    return Rig(TimingSettings(car=car, tracks=("peanut",)), prepared)
 
 
 def test_the_search_finds_the_same_each_time_and_worse_than_what_is_driven(
-    rig: Rig, prepared: Prepared, car: Car, counter: InstructionCounter
+    rig: Rig, prepared: Prepared, car: Car
 ) -> None:
     """All kinds of starts, within the bounds by construction, fall-back times without a step."""
-    found = list(search(rig, 10, seed=1, counted=False))
-    again = Rig(TimingSettings(car=car, tracks=("peanut",)), prepared, counter)
+    found = list(search(rig, 10, seed=1))
+    again = Rig(TimingSettings(car=car, tracks=("peanut",)), prepared)
     assert {case.kind for case, _ in found} == set(KINDS)
-    for (case, rows), (other, others) in zip(found, search(again, 10, 1, False), strict=True):
+    for (case, rows), (other, others) in zip(found, search(again, 10, 1), strict=True):
         assert case == other
         assert np.array_equal(rows[:, 4:6], others[:, 4:6])
         assert (rows[:, :4] > 0).all()
         assert rows[:, 4].max() <= rig.most_iterations
         assert rows[:, 5].max() <= rig.most_qp_steps
-    worst = max(work(rows, False) for _, rows in found)
-    drawn_alone = max(work(rows, False) for _, rows in found[:10])
-    assert worst >= drawn_alone >= 3 * work(rig.drive(0, 60)[5:], False)
+    worst = max(work(rows) for _, rows in found)
+    drawn_alone = max(work(rows) for _, rows in found[:10])
+    assert worst >= drawn_alone >= 3 * work(rig.drive(0, 60)[5:])
 
 
 def test_a_start_is_where_its_kind_says(rig: Rig, circuit: Circuit, car: Car) -> None:
@@ -121,16 +114,21 @@ def test_a_start_is_where_its_kind_says(rig: Rig, circuit: Circuit, car: Car) ->
         assert abs(delta) <= car.delta_max_rad
 
 
-def test_instructions_are_counted_or_it_is_said_why_not(counter: InstructionCounter) -> None:
-    if counter.missing:
-        assert counter.read() == 0
-        return
-    counts = []
-    for n in (1_000, 100_000):
-        begin = counter.read()
-        sum(range(n))
-        counts.append(counter.read() - begin)
-    assert counts[1] > 10 * counts[0] > 0
+@pytest.mark.check  # half a minute
+@pytest.mark.skipif(bool(missing()), reason=missing())
+def test_instructions_are_counted_the_same_each_time_and_grow_with_the_work(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A launch takes more to answer than a step soon after it; half the points take fewer."""
+    estimate, feedback, prepare = rig.count_recorded(4).T
+    assert rig.count_recorded(4)[:, 1] == pytest.approx(feedback, rel=1e-5)
+    assert feedback[0] > 2 * feedback[3] > 20 * estimate[3] > 0
+    first, second, third = (
+        replace(one, inputs=one.inputs[::2], alpha=one.alpha[::2]) for one in rig._weights.outputs
+    )
+    half = replace(rig._weights, outputs=(first, second, third))
+    monkeypatch.setattr(rig, "_weights", half)
+    assert rig.count_recorded(4)[:, 2].sum() < 0.85 * prepare.sum()
 
 
 @pytest.mark.parametrize(("at_most_ms", "code"), [(1e6, 0), (1e-6, 1)])
@@ -140,7 +138,7 @@ def test_the_verdict_is_by_the_limit_and_files_are_left(
 ) -> None:  # fmt: skip
     monkeypatch.setattr(study, "prepare", lambda *_, **__: prepared)
     settings = TimingSettings(
-        car=car, tracks=("peanut",), problems=900, cases=5, at_most_ms=at_most_ms
+        car=car, tracks=("peanut",), problems=900, cases=5, count=0, at_most_ms=at_most_ms
     )
     console = Console(file=(tmp_path / "text").open("w"), width=120)
     done = study.run_timing(settings, (), Stages(console, None))

@@ -207,8 +207,8 @@ def shadow(
 
 @options_of(
     "bayesrace.studies.evidence.timing.settings.TimingSettings",
-    "tracks problems cases rate_hz budget at_most_ms exceedance horizon sensors weights artefact "
-    "points seed car",
+    "tracks problems cases count rate_hz budget at_most_ms exceedance horizon sensors weights "
+    "artefact points seed car",
     file=True,
 )
 def timing(

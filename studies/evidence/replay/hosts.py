@@ -6,25 +6,19 @@ have one file of weights and no commands; they answer lockstep runs for as long 
 """
 
 import itertools
-import shutil
-import subprocess
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Final
 
-from bayesrace.codegen.build import HOST
-from bayesrace.codegen.compiler import find_compiler
 from bayesrace.codegen.fmu import FmuDefinition, controller_fmu, pack
-from bayesrace.codegen.host_files import export
 from bayesrace.controller.assembly import make_path_table
 from bayesrace.controller.cycle import Cycle as Timed
 from bayesrace.controller.driver import Decision, Driver
-from bayesrace.errors import InputError
 from bayesrace.files import temporary_folder
 from bayesrace.gp.weights import pack_weights
-from bayesrace.manifest import LIBRARY, read_manifest
-from bayesrace.messages import QUANTITIES, State, Telemetry
+from bayesrace.manifest import read_manifest
+from bayesrace.messages import QUANTITIES, Telemetry
+from bayesrace.studies.evidence.c_host import CHost
 from bayesrace.studies.evidence.replay.controller import Setup
 from bayesrace.studies.evidence.replay.recording import Cycle, Life
 
@@ -32,9 +26,6 @@ __all__ = ["Answer", "answers"]
 
 _BUDGET_S: Final = 2.0**-10
 """Of a repeated step: any above 0, as its clock does not count; a power of two adds no rounding."""
-
-C_HOST: Final = Path(__file__).resolve().parents[3] / "examples" / "c_host" / "main.c"
-"""In the repository; the package has no examples."""
 
 
 @dataclass(frozen=True)
@@ -153,62 +144,19 @@ def _plain(run: Sequence[Cycle]) -> list[Cycle]:
 
 
 def _c_host(setup: Setup, run: Sequence[Cycle]) -> Iterator[Answer]:
-    """By the program of examples/c_host, compiled here: it reads states and writes inputs."""
+    """By the program of examples/c_host, compiled here."""
     if not run:
         return
+    weights = setup.weights(run[0].sent.weights_version)
+    told = (state for cycle in run for state in cycle.states)
     with temporary_folder() as folder:
-        program = _c_program(setup.artefact, folder)
-        manifest, car = read_manifest(setup.artefact), setup.car
-        table = make_path_table(setup.track, setup.line, car.tuning.path.spacing_m)
-        values = setup.mpc.parameters(car, manifest.problem.name) | setup.cycle.cycle_values(car)
-        values |= car.tuning.estimation(nominal=False)
-        weights = setup.weights(run[0].sent.weights_version)
-        export(folder, manifest, table.rows, table.spacing_m, values, weights)
-        instruments: dict[str, int] = {}
-        lines = "".join(
-            _line(one, instruments)
-            for cycle in run
-            for one in cycle.states
-            if (one.epoch, one.run) == cycle.run
+        host = CHost.made(
+            folder, setup.artefact, setup.car, setup.track, setup.line, weights, setup.mpc
         )
-        done = subprocess.run(
-            [program, folder], input=lines, capture_output=True, text=True, check=False
-        )
-    if done.returncode:
-        raise InputError(f"the C host ended with code {done.returncode}: {done.stderr.strip()}")
-    found = {int(row[2]): row for row in map(str.split, done.stdout.splitlines())}
+        found = host.answers(one for one in told if (one.epoch, one.run) == run[0].run)
     for cycle in run:
-        if row := found.get(cycle.sent.state_seq):
-            yield Answer(cycle, (float(row[4]), float(row[5])), int(row[6]), int(row[7]))
-
-
-def _c_program(artefact: Path, folder: Path) -> Path:
-    if not C_HOST.is_file():
-        raise InputError(f"no {C_HOST}: --host c needs the repository, of which it is an example")
-    host, program = artefact / HOST, folder / "c_host"
-    shutil.copy(artefact / LIBRARY, folder / LIBRARY)
-    find_compiler().run(
-        "-O2", "-std=gnu11", C_HOST, host / "br_files.c", f"-I{artefact}", f"-I{host}",
-        folder / LIBRARY, f"-Wl,-rpath,{folder}", "-lm", "-o", program,
-    )  # fmt: skip
-    return program
-
-
-def _line(state: State, instruments: dict[str, int]) -> str:
-    """A state as the program reads it; ``instruments``: numbers by name, to which it adds."""
-    flags = int(state.lockstep), int(state.final)
-    numbers = (
-        state.epoch, state.run, state.seq, state.time_s, *flags, *state.x, *state.u_applied,
-        *state.actuation_delays[2::3],
-    )  # fmt: skip
-    words = [" ".join(map(repr, numbers))]
-    for one in state.readings if state.estimated else ():
-        number = instruments.setdefault(one.instrument, len(instruments))
-        values = ((QUANTITIES.index(name), *both) for name, both in one.values.items())
-        words.append(" ".join(map(repr, itertools.chain((number, one.time_s), *values))))
-    if state.estimated and not state.readings:
-        words.append("")
-    return " ; ".join(words) + "\n"
+        if answer := found.get(cycle.sent.state_seq):
+            yield Answer(cycle, *answer)
 
 
 def _fmu(setup: Setup, run: Sequence[Cycle]) -> Iterator[Answer]:

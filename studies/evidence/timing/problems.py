@@ -9,6 +9,7 @@ nor waiting count.
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -19,6 +20,7 @@ from bayesrace.controller.assembly import compiled_controller
 from bayesrace.controller.cycle import Cycle
 from bayesrace.controller.native_step import Artefact
 from bayesrace.controller.settings import CycleSettings, MpcSettings
+from bayesrace.files import temporary_folder
 from bayesrace.gp.weights import Weights, read_weights
 from bayesrace.messages import State
 from bayesrace.operation.closed_loop import built_in_car
@@ -27,14 +29,18 @@ from bayesrace.operation.run_plan import RunPlan, run_request
 from bayesrace.operation.training_drives import PreparedTrack
 from bayesrace.plant.car import CarRun, drive_lockstep
 from bayesrace.plant.simulator import PLANT
+from bayesrace.raceline import RaceLine
 from bayesrace.realtime import uncollected
-from bayesrace.studies.evidence.timing.counter import InstructionCounter
+from bayesrace.studies.evidence.c_host import CHost
+from bayesrace.studies.evidence.timing.instructions import Counts, count_instructions
 from bayesrace.studies.evidence.timing.settings import TimingSettings
+from bayesrace.tracks import Track
+from bayesrace.vehicles import Car
 
 __all__ = ["COLUMNS", "KINDS", "Case", "Rig", "search", "work"]
 
 COLUMNS: Final = (
-    "estimate", "feedback", "prepare", "fallback", "iterations", "qp_steps", "instructions"
+    "estimate", "feedback", "prepare", "fallback", "iterations", "qp_steps"
 )  # fmt: skip
 """Of a cycle: times [ms], then counts of the feedback."""
 
@@ -82,14 +88,14 @@ class Case:
 class Rig:
     """Controllers of each track, with weights as given and with rough ones at full capacity."""
 
-    def __init__(
-        self, settings: TimingSettings, prepared: Prepared, counter: InstructionCounter
-    ) -> None:
-        self._settings, self._files, self._counter = settings, prepared, counter
+    def __init__(self, settings: TimingSettings, prepared: Prepared) -> None:
+        self._settings, self._files = settings, prepared
         self.tracks: tuple[PreparedTrack, ...] = prepared.tracks
         self._car, self._vehicle = settings.driven_car, built_in_car(settings.driven_car)
         self._weights, self._run = read_weights(prepared.weights), 0
         self._made: dict[tuple[int, bool], tuple[Cycle, Cycle]] = {}
+        self._told: list[State] = []
+        """In the newest drive."""
         artefact, mpc = Artefact(prepared.artefacts[0]), MpcSettings()
         library, self._capacity = artefact.library, artefact.manifest.gp_capacity
         self.horizon = artefact.manifest.horizon
@@ -100,49 +106,72 @@ class Rig:
 
     def _answered(self, cycles: tuple[Cycle, Cycle], state: State, budget_s: float) -> list[float]:
         """Of a cycle by this state: what :data:`COLUMNS` says."""
-        (cycle, blind), count = cycles, self._counter.read
+        cycle, blind = cycles
+        self._told.append(state)
         estimate = _timed(lambda: cycle.driver.observe(state))
-        begin = count()
-        feedback = _timed(lambda: cycle.decide(state.time_s, budget_s))
-        instructions, info = count() - begin, cycle.driver.info
+        feedback, info = _timed(lambda: cycle.decide(state.time_s, budget_s)), cycle.driver.info
         counts = (info.iterations, info.qp_iterations) if cycle.driver.decision.stepped else (0, 0)
         prepare = _timed(lambda: cycle.prepare(PLANT.step_s, budget_s))
         blind.driver.observe(state)
         fallback = _timed(lambda: blind.decide(state.time_s + _TOO_LATE_S))
-        return [estimate, feedback, prepare, fallback, *counts, instructions]
+        return [estimate, feedback, prepare, fallback, *counts]
 
     def _begin(self, track: int, rough: bool = False) -> tuple[Cycle, Cycle]:
         """One that drives, and one for the fallback, for another run: its first state counts."""
         self._run += 1
         if (track, rough) not in self._made:
-            one, weights = self.tracks[track], self._weights
-            if rough:
-                weights = _roughened(weights, self._capacity, self._settings.seed)
-            files = self._files.artefacts[0], self._car, one.track, one.line, weights
+            files = self._parts(track, rough)
             cycle, blind = (
                 Cycle(compiled_controller(*files), self._car, CycleSettings()) for _ in range(2)
             )
             self._made[track, rough] = cycle, blind
         for each in self._made[track, rough]:
             each.driver.lost(silent=False)
+        self._told.clear()
         return self._made[track, rough]
 
+    def _parts(self, track: int, rough: bool) -> tuple[Path, Car, Track, RaceLine, Weights]:
+        """What a controller is made of."""
+        one, weights = self.tracks[track], self._weights
+        if rough:
+            weights = _roughened(weights, self._capacity, self._settings.seed)
+        return self._files.artefacts[0], self._car, one.track, one.line, weights
+
     def replay(self, states: Sequence[State]) -> Floats:
-        """Cycles (n, 7) by the states of one run on the first track, whatever the answers are."""
+        """Cycles (n, 6) by the states of one run on the first track, whatever the answers are."""
         cycles = self._begin(0)
         again = (structs.replace(one, run=self._run) for one in states if not one.final)
         with uncollected():
             return np.array([self._answered(cycles, one, self._budget_s) for one in again])
 
     def drive(self, track: int, count: int) -> Floats:
-        """Cycles (n, 7) of a drive from the start line."""
+        """Cycles (n, 6) of a drive from the start line."""
         return self._driven(self._begin(track), track, count, self._budget_s)
 
     def run(self, case: Case, budget_s: float | None = None) -> Floats:
-        """Cycles (n, 7) from the case's start, with that budget; None: that of the settings."""
+        """Cycles (n, 6) from the case's start, with that budget; None: that of the settings."""
         cycles = self._begin(case.track, case.kind == "weights")
         budget_s = self._budget_s if budget_s is None else budget_s
         return self._driven(cycles, case.track, _CYCLES, budget_s, self._start(case))
+
+    def count(self, case: Case) -> Counts:
+        """Instructions of the phases (n, 3) in the case's cycles, without budgets."""
+        self.run(case, budget_s=0.0)
+        return self._count(case.track, case.kind == "weights")
+
+    def count_recorded(self, most: int, states: Sequence[State] = ()) -> Counts:
+        """The same of the first cycles of a run of logs, or of a drive from the start line."""
+        if states:
+            self.replay(states[:most])
+        else:
+            self.drive(0, most)
+        return self._count(0)
+
+    def _count(self, track: int, rough: bool = False) -> Counts:
+        told = [structs.replace(one, lockstep=True) for one in self._told]
+        with temporary_folder() as folder:
+            host = CHost.made(folder, *self._parts(track, rough), MpcSettings())
+            return count_instructions(host, told)
 
     @property
     def _budget_s(self) -> float:
@@ -206,13 +235,12 @@ def _roughened(weights: Weights, capacity: int, seed: int) -> Weights:
     return replace(weights, version="rough", outputs=(first, second, third))
 
 
-def work(rows: Floats, counted: bool) -> float:
-    """Of the hardest cycle: instructions where they are ``counted``, else iterations times QP
-    steps. The same each time, as times are not."""
-    return float(rows[:, 6].max() if counted else (rows[:, 4] * rows[:, 5]).max())
+def work(rows: Floats) -> float:
+    """Of the hardest cycle: iterations times QP steps. The same each time, as times are not."""
+    return float((rows[:, 4] * rows[:, 5]).max())
 
 
-def search(rig: Rig, cases: int, seed: int, counted: bool) -> Iterator[tuple[Case, Floats]]:
+def search(rig: Rig, cases: int, seed: int) -> Iterator[tuple[Case, Floats]]:
     """So many cases drawn at random, all kinds in turn, then as many that climb from the worst,
     each with its cycles, which have no budget: their work depends on nothing else."""
     random, names = np.random.default_rng(seed), tuple(KINDS)
@@ -223,5 +251,5 @@ def search(rig: Rig, cases: int, seed: int, counted: bool) -> Iterator[tuple[Cas
         else:
             case = worst[int(random.integers(len(worst)))][1].changed(random)
         rows = rig.run(case, budget_s=0.0)
-        worst = sorted([*worst, (work(rows, counted), case)], key=lambda one: -one[0])[:5]
+        worst = sorted([*worst, (work(rows), case)], key=lambda one: -one[0])[:5]
         yield case, rows

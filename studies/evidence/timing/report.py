@@ -40,9 +40,13 @@ def print_study(study: Study, console: Console) -> None:
     console.print(Text(f"{counts} cycles; N = {result.horizon}. Hardest starts, without budget:"))
     for text in result.worst:
         console.print(Text(f"  {text}"))
-    if result.counter:
-        console.print(Text(f"No counter of instructions here ({result.counter}): the search climbs "
-                           "by iterations times QP steps."))  # fmt: skip
+    if result.not_counted:
+        console.print(Text(f"Instructions are not counted: {result.not_counted}."))
+    else:
+        table = plain_table("million instructions", "p50", "max", padding=0)
+        for counted in result.instructions:
+            table.add_row(counted.name, f"{1e-6 * counted.p50:.3f}", f"{1e-6 * counted.most:.3f}")
+        console.print(table)
     console.print(Text(result.statement))
 
 

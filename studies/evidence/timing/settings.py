@@ -29,6 +29,11 @@ class TimingSettings(PreparationSettings):
         150, ge=5, le=100_000,
         description="adversarial starts: drawn at random, then as many changed from the worst",
     )  # fmt: skip
+    count: int = Field(
+        50, ge=0, le=100_000,
+        description="recorded cycles whose instructions valgrind counts, beside those of the "
+        "hardest start; 0: none",
+    )  # fmt: skip
     rate_hz: float = Field(50.0, ge=1, le=500, description="rate of the controller [Hz]")
     budget: float = Field(
         0.8, ge=0, le=1, description="share of the period that a cycle may take; 0: no limit"

@@ -2,7 +2,6 @@
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -16,7 +15,7 @@ from bayesrace.log import LogReader
 from bayesrace.messages import STATE, State
 from bayesrace.operation.preparation import prepare
 from bayesrace.operation.terminal.terminal import Stages
-from bayesrace.studies.evidence.timing.counter import InstructionCounter
+from bayesrace.studies.evidence.timing.instructions import COUNTED, Counts, missing
 from bayesrace.studies.evidence.timing.problems import COLUMNS, Case, Rig, search, work
 from bayesrace.studies.evidence.timing.settings import TimingSettings
 from bayesrace.studies.evidence.timing.tail import Tail, fit_tail
@@ -26,6 +25,9 @@ __all__ = ["PHASES", "Study", "TimingResult", "run_timing"]
 
 PHASES: Final = ("estimate", "feedback", "answer", "prepare", "fallback")
 """Of a cycle; the answer is estimate and feedback, what a state waits for."""
+
+_HARDEST: Final = 5
+"""Starts that are named; the instructions of the first are counted."""
 
 _BLOCK: Final = 5
 """Cycles of which the longest counts as one value of the tail: neighbours are alike."""
@@ -55,7 +57,15 @@ class Hardest(BaseModel):
     name: str
     most: int
     bound: int
-    """By construction; 0: none."""
+    """By construction."""
+
+
+class Counted(BaseModel):
+    """Instructions of a phase; its name is as that of its :class:`Times`."""
+
+    name: str
+    p50: int
+    most: int
 
 
 class TimingResult(BaseModel):
@@ -71,8 +81,10 @@ class TimingResult(BaseModel):
     hardest: tuple[Hardest, ...]
     worst: tuple[str, ...]
     """The starts that take the most, hardest first."""
-    counter: str
-    """Why instructions are not counted; empty: they are."""
+    instructions: tuple[Counted, ...]
+    """Without budgets; of the hardest start in place of all adversarial ones."""
+    not_counted: str
+    """Why they are not; empty: they are."""
     statement: str
 
 
@@ -92,18 +104,25 @@ def run_timing(settings: TimingSettings, logs: Sequence[Path], stages: Stages) -
     prepared = prepare(
         settings, settings.driven_on, stages, weights=settings.weights, artefact=settings.artefact
     )
-    with closing(InstructionCounter()) as counter:
-        rig, counted = Rig(settings, prepared, counter), not counter.missing
-        with stages.stage("recorded problems"):
-            recorded = list(_recorded(rig, runs, settings.problems))
-        with stages.stage("search for the worst") as stage:
-            found = list[tuple[Case, Floats]]()
-            for one in search(rig, settings.cases, settings.seed, counted):
-                found.append(one)
-                stage.update(len(found) / (2 * settings.cases))
-        with stages.stage("adversarial problems"):
-            adversarial = [rig.run(case) for case, _ in found]
-    found.sort(key=lambda one: -work(one[1], counted))
+    rig = Rig(settings, prepared)
+    with stages.stage("recorded problems"):
+        recorded = list(_recorded(rig, runs, settings.problems))
+    with stages.stage("search for the worst") as stage:
+        found = list[tuple[Case, Floats]]()
+        for one in search(rig, settings.cases, settings.seed):
+            found.append(one)
+            stage.update(len(found) / (2 * settings.cases))
+    with stages.stage("adversarial problems"):
+        adversarial = [rig.run(case) for case, _ in found]
+    found.sort(key=lambda one: -work(one[1]))
+    hardest, not_counted = found[:_HARDEST], missing() if settings.count else "--count is 0"
+    instructions = tuple[Counted, ...]()
+    if not not_counted:
+        with stages.stage("count of instructions"):
+            instructions = (
+                *_counted("recorded", rig.count_recorded(settings.count, runs[0] if runs else ())),
+                *_counted("adversarial", rig.count(hardest[0][0])),
+            )
     drives = {"recorded": recorded, "adversarial": adversarial}
     everything = np.vstack([*recorded, *adversarial, *(rows for _, rows in found)])
     values = {
@@ -116,8 +135,8 @@ def run_timing(settings: TimingSettings, logs: Sequence[Path], stages: Stages) -
         car=settings.car.name, tracks=tuple(one.track.name for one in rig.tracks),
         rate_hz=settings.rate_hz, limit_ms=settings.limit_ms, horizon=rig.horizon,
         cycles={name: sum(map(len, some)) for name, some in drives.items()},
-        times=times, hardest=tuple(_hardest(rig, everything, counted)), counter=counter.missing,
-        worst=tuple(_text(rig, case, rows) for case, rows in found[:5]),
+        times=times, hardest=tuple(_hardest(rig, everything)), instructions=instructions,
+        not_counted=not_counted, worst=tuple(_text(rig, case, rows) for case, rows in hardest),
         statement=_statement(next(one for one in times if one.name == "recorded answer")),
     )  # fmt: skip
     checks = sorted(_checks(result, len(everything)), key=lambda one: one.subject)
@@ -167,9 +186,15 @@ def _times(name: str, ms: Floats, recorded: Sequence[Floats], exceedance: float)
     return Times(name=name, p50=p50, p99=p99, p999=p999, max=most, tail=tail)
 
 
-def _hardest(rig: Rig, everything: Floats, counted: bool) -> Iterator[Hardest]:
+def _counted(problems: str, counts: Counts) -> Iterator[Counted]:
+    for phase, column in zip(COUNTED, counts.T, strict=True):
+        name = f"{problems} {phase}"
+        yield Counted(name=name, p50=int(np.median(column)), most=int(column.max()))
+
+
+def _hardest(rig: Rig, everything: Floats) -> Iterator[Hardest]:
     bounds = {"iterations": rig.most_iterations, "qp_steps": rig.most_qp_steps}
-    for name, bound in (bounds | ({"instructions": 0} if counted else {})).items():
+    for name, bound in bounds.items():
         most = int(everything[:, COLUMNS.index(name)].max())
         yield Hardest(name=name, most=most, bound=bound)
 
@@ -192,10 +217,9 @@ def _checks(result: TimingResult, feedbacks: int) -> Iterator[Check]:
             text = f"{one.usable.upper:.3g} ms with confidence {one.usable.confidence:.0%}"
             yield Check(phase, what, one.usable.upper <= limit, text)
     for hard in result.hardest:
-        if hard.bound:
-            what = f"by construction at most {hard.bound} {hard.name}"
-            text = f"{hard.most} of {feedbacks} feedbacks"
-            yield Check("work of a feedback", what, hard.most <= hard.bound, text)
+        what = f"by construction at most {hard.bound} {hard.name}"
+        text = f"{hard.most} of {feedbacks} feedbacks"
+        yield Check("work of a feedback", what, hard.most <= hard.bound, text)
 
 
 def _statement(answer: Times) -> str:
