@@ -207,16 +207,24 @@ class LogReader:
         """Parts of the recording before the first message that is read."""
         return _count(self.part.get("number", ""))
 
+    def contents(self) -> tuple[set[str], dict[str, dict[str, str]]]:
+        """:meth:`channels` and :meth:`metadata`, which take a whole reading each."""
+        keys: set[str] = set()
+        metadata: dict[str, dict[str, str]] = {}
+        for record in self._records(_Place(self._first)):
+            if isinstance(record, Channel):
+                keys.add(record.topic)
+            elif isinstance(record, Metadata):
+                metadata[record.name] = dict(record.metadata)
+        return keys, metadata
+
     def metadata(self) -> dict[str, dict[str, str]]:
         """Name to map of texts; the last of one name wins."""
-        everything = self._records(_Place(self._first))
-        found = (record for record in everything if isinstance(record, Metadata))
-        return {record.name: dict(record.metadata) for record in found}
+        return self.contents()[1]
 
     def channels(self) -> set[str]:
         """The keys that it holds messages of."""
-        everything = self._records(_Place(self._first))
-        return {record.topic for record in everything if isinstance(record, Channel)}
+        return self.contents()[0]
 
     def messages(self, topics: Collection[Topic[Any]] = TOPICS) -> Iterator[Entry[Any]]:
         """The messages of these topics, typed; those that cannot be decoded are counted.

@@ -96,9 +96,8 @@ class LogFacts:
 
 def log_facts(path: str | os.PathLike[str]) -> LogFacts:
     """Reads keys and metadata; InputError if it is no log or its metadata are damaged."""
-    reader = LogReader(Path(path))
-    keys = [(topic_of(key), key.split("/")[1]) for key in reader.channels()]
-    metadata = reader.metadata()
+    channels, metadata = LogReader(Path(path)).contents()
+    keys = [(topic_of(key), key.split("/")[1]) for key in channels]
     settings: dict[str, Any] = dict(metadata.get("collect") or metadata.get("drive") or {})
     try:
         for program in ("race", "latency"):

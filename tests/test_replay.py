@@ -83,7 +83,7 @@ def lockstep(
 
 
 def test_a_lockstep_drive_is_answered_to_the_bit_with_weights_and_commands(lockstep: Path) -> None:
-    (life,) = read_lives(lockstep / "run.mcap")
+    (life,) = read_lives(lockstep / "run.mcap", ["car"])
     versions = {one.sent.weights_version for one in life.cycles}
     assert len(versions) == 2
     assert [word for one in life.cycles for word in one.commands] == ["stop", "go"]
@@ -102,7 +102,7 @@ def test_a_real_time_drive_is_answered_to_the_bit(
         tmp_path, car, circuit.track, laps=9, mode="realtime", line=circuit.line, weights=weights,
         delay_ms=6.0, max_time_s=8.0,
     )  # fmt: skip
-    (life,) = read_lives(tmp_path / "run.mcap")
+    (life,) = read_lives(tmp_path / "run.mcap", ["car"])
     assert len(life.cycles) > 300
     assert any(one.how.prepared_refused for one in life.cycles)  # time always runs out there
     verdict = replayed(tmp_path)

@@ -1,6 +1,7 @@
 """By what a recorded drive is answered again: the controller that drove it, or another."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -18,7 +19,6 @@ from bayesrace.controller.settings import CycleSettings, MpcSettings
 from bayesrace.errors import InputError
 from bayesrace.files import read_text
 from bayesrace.gp.weights import Weights, read_weights
-from bayesrace.learning.sources import log_facts
 from bayesrace.manifest import MANIFEST, read_manifest
 from bayesrace.operation.preparation import model_artefact, progress_artefact
 from bayesrace.operation.settings import RaceSettings
@@ -81,36 +81,37 @@ class Setup:
     def weights(self, version: str) -> Weights | None:
         """Those in place of the recorded ones of that version; InputError if they are nowhere."""
         if self.given.weights is not None:
-            return self._known[""]
+            return read_weights(self.given.weights)
         if not version:
             return None
-        if version not in self._known:
-            raise InputError(
-                f"no weights of version {version} beside the log in {self.folder}: put their file "
-                "there, or name the weights to drive with by --weights"
-            )
+        while version not in self._known:
+            if (one := next(self._found, None)) is None:
+                raise InputError(
+                    f"no weights of version {version} beside the log in {self.folder}: put their "
+                    "file there, or name the weights to drive with by --weights"
+                )
+            self._known[one.version] = one
         return self._known[version]
 
     @cached_property
-    def _known(self) -> Mapping[str, Weights]:
-        if self.given.weights is not None:
-            return {"": read_weights(self.given.weights)}
-        found: dict[str, Weights] = {}
-        for file in (*cache_folder().glob("weights-*.bin"), *self.folder.glob("*.bin")):
-            try:
-                one = read_weights(file)
-            except InputError:  # another file's business
-                continue
-            found[one.version] = one
-        return found
+    def _known(self) -> dict[str, Weights]:
+        return {}
+
+    @cached_property
+    def _found(self) -> Iterator[Weights]:
+        """All that are beside the log or in the cache."""
+        for file in (*self.folder.glob("*.bin"), *cache_folder().glob("weights-*.bin")):
+            with suppress(InputError):  # another file's business
+                yield read_weights(file)
 
 
-def set_up(log: Path, controller: str, given: Given) -> Setup:
+def set_up(log: Path, driven: Car | None, controller: str, given: Given) -> Setup:
     """For the log of that ``controller`` of a race, empty if it is of another recording: from the
-    files beside it, and what is given. InputError if something is missing."""
+    car that it names, if any, the files beside it, and what is given. InputError if something is
+    missing."""
     folder = log.parent
     race = _race(folder) if controller else None
-    car = get_car(given.car) if given.car else log_facts(log).car or _car(folder)
+    car = get_car(given.car) if given.car else driven or _car(folder)
     track = _track(folder, given, car)
     line_file = given.raceline or _first(folder, "race_raceline.csv", "raceline.csv")
     line = read_raceline_for(line_file, track, car) if line_file else racing_line(track, car)

@@ -1,7 +1,7 @@
 """What a controller process was told, cycle by cycle, and what it answered, read from a log."""
 
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import groupby
 from pathlib import Path
@@ -10,7 +10,6 @@ from typing import Any, Final
 from bayesrace.controller.interface import Environment
 from bayesrace.controller.native_step import Status
 from bayesrace.errors import InputError
-from bayesrace.learning.sources import log_facts
 from bayesrace.log import LogReader
 from bayesrace.messages import (
     ACTUATION,
@@ -88,9 +87,10 @@ def _run(message: State | Actuation) -> tuple[int, int]:
     return message.epoch, message.run
 
 
-def read_lives(path: Path) -> list[Life]:
-    """The controller processes of a log, in order; InputError for no log of one car's drive."""
-    names = log_facts(path).names
+def read_lives(path: Path, names: Collection[str]) -> list[Life]:
+    """The controller processes of a log, in order; InputError for no log of one car's drive.
+
+    ``names``: those of its cars (:func:`~bayesrace.learning.sources.log_facts`)."""
     if len(names) != 1:
         found = f"of {', '.join(names)}" if names else "of no car"
         raise InputError(f"{path} holds states {found}: give the log of one car's drive")

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from bayesrace.errors import InputError
 from bayesrace.files import replacing, write_whole
+from bayesrace.learning.sources import log_facts
 from bayesrace.operation.terminal.terminal import Stages
 from bayesrace.studies.evidence.replay.comparison import (
     ROWS,
@@ -118,8 +119,9 @@ def _one(name: str, path: Path, given: Given, allowed: Tolerance) -> Replayed:
     same, cycles, said = True, 0, ""
     unknown: Counter[str] = Counter()
     try:
-        for life in read_lives(path):
-            setup = set_up(path, life.controller, given)
+        facts = log_facts(path)
+        for life in read_lives(path, facts.names):
+            setup = set_up(path, facts.car, life.controller, given)
             found = list(answers(setup, life))
             same &= setup.same
             cycles += len(life.cycles)
@@ -152,7 +154,7 @@ def _baseline(folder: Path, name: str) -> NDArray[Any]:
         return rows
     for path in (folder / f"{name}.mcap", folder / name / _LOG):
         if path.is_file():
-            every = [one for life in read_lives(path) for one in life.cycles]
+            every = [one for life in read_lives(path, log_facts(path).names) for one in life.cycles]
             recorded = [
                 Answer(one, (one.sent.u[0], one.sent.u[1]), one.sent.status, one.how.fallback)
                 for one in every
