@@ -38,7 +38,7 @@ _LONG_BATCH_S: Final = 0.05
 """... and in lockstep: fewer interruptions of what is recorded, and code that is in the caches."""
 _REAL_TIME_HZ: Final = 3000
 """More messages a second than real time brings (four a cycle, at 500 Hz): it is lockstep."""
-_CHANNEL_CAPACITY: Final = 1 << 16
+_CHANNEL_CAPACITY: Final = 1 << 13
 _MOST_OTHER_KEYS: Final = 256
 """Keys that are not in the table of messages; the format has room for 65,535."""
 

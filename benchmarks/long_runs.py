@@ -40,7 +40,7 @@ GROWTH_MB: Final = 5.0
 """That plant and controller may grow by in an hour ..."""
 RECORDER_MB: Final = 60.0
 """... and, in real time, the process that records without a limit: the index of a log is written at
-its end. In lockstep messages wait in its channel, up to 65,536 for each of the two logs."""
+its end. In lockstep messages wait in its channel, up to 8,192 for each of the two logs."""
 
 DRIVEN: Final = {
     "plant": ("time_s", "laps", "runs", "states_sent", "actuations_received"),
