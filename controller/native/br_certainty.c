@@ -18,6 +18,8 @@
  *
  * Plans are judged by the same distance (see br_step.c).
  */
+#include <float.h>
+
 #include "br_internal.h"
 
 #if BR_HAS_PATH
@@ -142,7 +144,7 @@ static void try_slower(const br_mpc *mpc, const br_gp *gp, const double variance
     if (off <= at->room) {
         if (at->known < at->speed)
             at->known *= pow(SLOWER, fmax(log(off / at->room) / log(before / off), -1));
-    } else if (at->known * SLOWER >= BR_CAUTION_LEAST * at->speed) {
+    } else if (at->known * SLOWER > fmax(BR_CAUTION_LEAST * at->speed, DBL_MIN)) {
         at->known *= SLOWER;
         at->decided = 0;
     }
