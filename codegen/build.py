@@ -1,10 +1,10 @@
 """From settings to a loadable controller: generate C, compile, cache by a hash of everything.
 
 The artefact folder holds the library, what its headers declare in the form that Python reads, the
-manifest, and everything it was made from (our C, CasADi's C, DAQP's headers and static library for
-this platform, MIT licence), so that it can be rebuilt or embedded without Python:
-``cc -O3 *.c libdaqpstat.a -I. -lm``. Its folder ``host`` has C that loads racing line, weights and
-settings from files.
+manifest, and everything it was made from (our C, CasADi's C, DAQP's headers and its static library
+for this platform or its C, MIT licence), so that it can be rebuilt or embedded without Python:
+``cc -O3 *.c libdaqpstat.a -I. -lm``, or ``cc -O3 *.c daqp/*.c -I. -lm``. Its folder ``host`` has C
+that loads racing line, weights and settings from files.
 """
 
 import hashlib
@@ -19,8 +19,11 @@ from typing import TYPE_CHECKING, Final
 
 from bayesrace.cache import code_folder, digest, kept, locked, note_use, software
 from bayesrace.codegen.compiler import FLAGS, Compiler, find_compiler
+from bayesrace.codegen.daqp import HOW_TO_GET, unpack_sources
+from bayesrace.codegen.platforms import Platform, host_platform
 from bayesrace.codegen.settings import BuildSettings
 from bayesrace.errors import InputError
+from bayesrace.files import read_whole
 from bayesrace.manifest import (
     DECLARATIONS,
     LIBRARY,
@@ -68,7 +71,10 @@ _SHAPED_BY: Final = (
 
 
 def build_hash(
-    settings: BuildSettings, compiler: Compiler, problem: "Problem | None" = None
+    settings: BuildSettings,
+    compiler: Compiler,
+    problem: "Problem | None" = None,
+    daqp: Path | None = None,
 ) -> str:
     """Identity of the artefact: settings, car, every source file, CasADi, compiler.
 
@@ -77,6 +83,7 @@ def build_hash(
     return digest(
         [
             *_identity_of(problem),
+            *([] if daqp is None else [read_whole(daqp, "DAQP")]),
             settings.model_dump_json(),
             get_car(settings.car).model_dump_json(),
             *compiler.command,
@@ -147,9 +154,11 @@ def casadi_includes() -> tuple[Path, Path]:
     return package / "include", package / "libdaqpstat.a"
 
 
-def _compile(problem: "Problem", settings: BuildSettings, compiler: Compiler, folder: Path) -> None:
+def _compile(
+    problem: "Problem", settings: BuildSettings, compiler: Compiler, daqp: Path | None, folder: Path
+) -> None:
     """Everything of an artefact but its manifest, into an empty folder."""
-    include, daqp = casadi_includes()
+    include, archive = casadi_includes()
     generate(problem, settings, folder)
     for path in NATIVE.glob("*.[ch]"):
         shutil.copy(path, folder)
@@ -157,8 +166,11 @@ def _compile(problem: "Problem", settings: BuildSettings, compiler: Compiler, fo
     shutil.copytree(include / "daqp", folder / "daqp")
     # its licence wants to go where its code goes
     shutil.copy(include / "licenses" / "daqp-external" / "LICENSE", folder / "daqp")
-    shutil.copy(daqp, folder)
-    (folder / LIBRARY).write_bytes(_library(compiler, folder, folder / daqp.name))
+    if daqp is None:
+        shutil.copy(archive, folder)
+    else:
+        unpack_sources(daqp, folder / "daqp")
+    (folder / LIBRARY).write_bytes(_library(compiler, folder))
     _write_declarations(compiler, folder)
 
 
@@ -181,15 +193,16 @@ def _write_declarations(compiler: Compiler, folder: Path) -> None:
         make_py_source(ffi, Path(DECLARATIONS).stem, str(folder / DECLARATIONS))
 
 
-def _library(compiler: Compiler, folder: Path, daqp: Path) -> bytes:
+def _library(compiler: Compiler, folder: Path) -> bytes:
     """The library of the sources in a folder; compiled once for all cars that share them, such as
     those that differ in weights, margins or friction alone."""
-    files = sorted((*folder.rglob("*.[ch]"), daqp))
+    archives, sources = list(folder.glob("*.a")), [*folder.glob("*.c"), *folder.glob("daqp/*.c")]
+    files = sorted((*folder.rglob("*.[ch]"), *archives))
     named = (part for file in files for part in (file.name, file.read_bytes()))
     identity = digest((*compiler.command, compiler.version, *FLAGS, *named))
 
     def make(path: Path) -> None:
-        compiler.shared_library(sorted(folder.glob("*.c")), [folder], [daqp], path)
+        compiler.shared_library(sorted(sources), [folder], archives, path)
         data = path.read_bytes()
         path.write_bytes(hashlib.sha256(data).digest() + data)
 
@@ -212,16 +225,27 @@ def build(
     settings: BuildSettings,
     progress: Callable[[str], None] = lambda _: None,
     problem: "Problem | None" = None,
+    platform: Platform | None = None,
+    daqp: Path | None = None,
 ) -> tuple[Path, Manifest]:
     """Artefact folder and manifest of the controller; from the cache if it is there.
 
     ``problem``: one of your own, with the step of ``settings.discretisation``; that of the
-    settings without.
+    settings without. ``platform``: what it is to run on (None: this machine), by the compiler that
+    ``CC`` names or else by ziglang. ``daqp``: DAQP's source distribution in place of the static
+    library that CasADi's wheel has, which is for this machine alone.
     Raises CompileError with the compiler's own words, InputError if there is no compiler.
     """
     cache = code_folder()
     compiler = find_compiler()
-    identity = build_hash(settings, compiler, problem)
+    if platform is not None and not platform.machine:
+        raise InputError(f"controllers are built for Linux, not for {platform.name}")
+    if platform is not None and platform != host_platform():
+        if daqp is None:
+            raise InputError(f"for {platform.name}, DAQP's C is missing: {HOW_TO_GET}")
+        if "CC" not in os.environ:
+            compiler = platform.compiler()
+    identity = build_hash(settings, compiler, problem, daqp)
     name = problem.name if problem else f"{settings.problem}-{settings.model}"
     target = cache / f"{name}-{identity}"
 
@@ -248,7 +272,9 @@ def build(
             folder = Path(temporary) / "artefact"
             folder.mkdir()
             problem = problem or problem_of(settings)
-            _compile(problem, settings, compiler, folder)
+            _compile(problem, settings, compiler, daqp, folder)
+            if platform is not None:
+                platform.check(folder / LIBRARY, compiler)
             manifest = _manifest(problem, settings, compiler, identity, folder)
             (folder / MANIFEST).write_text(manifest.model_dump_json(indent=1) + "\n")
             for one in (folder, *(folder / name for name in (LIBRARY, DECLARATIONS, MANIFEST))):

@@ -5,23 +5,26 @@ import itertools
 import shutil
 import socket
 import subprocess
-from collections.abc import Iterable, Iterator
+import sys
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from bayesrace.codegen.build import HOST
+from bayesrace.codegen.build import HOST, build
 from bayesrace.codegen.compiler import find_compiler
 from bayesrace.codegen.host_files import SETTINGS_FILE, export
+from bayesrace.codegen.platforms import get_platform
+from bayesrace.codegen.settings import BuildSettings
 from bayesrace.controller.assembly import PredictiveController
 from bayesrace.controller.driver import Level
 from bayesrace.controller.native_step import NativeStep
 from bayesrace.controller.process_settings import ControllerSettings
 from bayesrace.gp.weights import Weights
 from bayesrace.log import LogReader, LogWriter
-from bayesrace.manifest import read_manifest
+from bayesrace.manifest import LIBRARY, read_manifest
 from bayesrace.messages import ACTUATION, QUANTITIES, STATE, TELEMETRY, State
 from bayesrace.operation.closed_loop import ClosedLoop
 from bayesrace.vehicles import Car
@@ -30,6 +33,7 @@ from tests.conftest import SETTINGS, Circuit
 from tests.instruments import odometry, reading
 from tests.native_programs import SANITIZED, native_program
 from tests.programs import ROOT
+from tests.shared import shared_folder
 
 SOURCE = ROOT / "examples" / "c_host"
 LAPS = 1
@@ -82,10 +86,10 @@ def line_of(state: State) -> str:
     return line + (" ;" if state.estimated and not state.readings else "") + "\n"
 
 
-def answers(program: Path, data: Path, states: Iterable[State]) -> list[list[str]]:
+def answers(program: Sequence[str | Path], data: Path, states: Iterable[State]) -> list[list[str]]:
     sent_lines = "".join(map(line_of, states))
     done = subprocess.run(
-        [program, data], input=sent_lines, capture_output=True, text=True, check=True, timeout=120
+        [*program, data], input=sent_lines, capture_output=True, text=True, check=True, timeout=300
     )
     return [line.split() for line in done.stdout.splitlines()]
 
@@ -103,13 +107,66 @@ def test_a_recorded_drive_is_answered_to_the_bit(
     loop.drive(LAPS)
     log.close()
     reader = LogReader(tmp_path / "log.mcap")
-    rows = answers(program, data, reader.select(STATE))
+    rows = answers([program], data, reader.select(STATE))
     actuations, telemetry = reader.select(ACTUATION), reader.select(TELEMETRY)
     assert len(rows) == len(actuations) > 100
     for row, sent, how in zip(rows, actuations, telemetry, strict=True):
         assert tuple(map(int, row[:3])) == (sent.epoch, sent.run, sent.state_seq)
         assert tuple(map(float, row[3:6])) == (sent.decided_at_s, *sent.u)
         assert tuple(map(int, row[6:])) == (sent.status, how.fallback)
+
+
+@pytest.fixture(scope="module")
+def daqp() -> Path:
+    """Its source distribution, of the package index."""
+    wanted = "daqp==0.5.1"
+
+    def download(folder: Path) -> None:
+        line = [sys.executable, "-m", "pip", "download", "-q", "--no-deps", "--no-binary", "daqp"]
+        subprocess.run([*line, wanted, "-d", folder], check=True, timeout=600)
+
+    try:
+        return next(shared_folder("daqp", [wanted], download).glob("daqp-*.tar.gz"))
+    except (subprocess.SubprocessError, StopIteration) as error:
+        pytest.skip(f"{wanted} cannot be downloaded: {error}")
+
+
+@pytest.mark.check
+@pytest.mark.timeout(1500)  # ziglang builds a C library per target the first time
+@pytest.mark.parametrize(
+    ("name", "emulator", "of_sources"),
+    [
+        ("aarch64-linux", ("qemu-aarch64", "-L", "/usr/aarch64-linux-gnu"), False),
+        ("aarch32-linux", ("qemu-arm",), True),
+    ],
+)
+def test_on_other_processors_a_recorded_drive_is_answered_alike(
+    name: str, emulator: tuple[str, ...], of_sources: bool, program: Path, data: Path,
+    daqp: Path, circuit: Circuit, car: Car, native: NativeStep, tmp_path: Path, ziglang: None,
+) -> None:  # fmt: skip
+    """By the library that is built for them, or a program of the artefact's sources."""
+    if not shutil.which(emulator[0]) or not all(Path(one).exists() for one in emulator[2:]):
+        pytest.skip(f"not installed: {' '.join(emulator)}")
+    platform = get_platform(name)
+    artefact, _ = build(BuildSettings(), platform=platform, daqp=daqp)
+    target = platform.zig
+    code: list[str | Path] = [artefact / LIBRARY, f"-Wl,-rpath,{artefact}"]
+    if of_sources:
+        target = target.replace("gnu", "musl").split(".")[0]
+        code = ["-static", *artefact.glob("*.c"), *artefact.glob("daqp/*.c")]
+    host = artefact / HOST
+    line: list[str | Path] = [sys.executable, "-m", "ziglang", "cc", "-target", target, "-O2"]
+    line += [SOURCE / "main.c", host / "br_files.c", *code, f"-I{artefact}", f"-I{host}", "-lm"]
+    subprocess.run([*line, "-o", tmp_path / "c_host"], check=True, timeout=600)
+    log = LogWriter(tmp_path / "log.mcap")
+    loop = ClosedLoop(car, circuit.track, circuit.line, PredictiveController(native), log=log)
+    loop.drive(LAPS)
+    log.close()
+    states = LogReader(tmp_path / "log.mcap").select(STATE)
+    expected = np.array(answers([program], data, states), dtype=float)
+    rows = np.array(answers([*emulator, tmp_path / "c_host"], data, states), dtype=float)
+    np.testing.assert_allclose(rows[:, 4:6], expected[:, 4:6], rtol=0, atol=1e-9)
+    np.testing.assert_array_equal(rows[:, 6:], expected[:, 6:])
 
 
 def test_a_drive_by_readings_is_answered_to_the_bit(
@@ -123,7 +180,7 @@ def test_a_drive_by_readings_is_answered_to_the_bit(
     loop.drive(LAPS, max_time_s=6.0)
     log.close()
     reader = LogReader(tmp_path / "log.mcap")
-    rows, sent = answers(program, data, reader.select(STATE)), reader.select(ACTUATION)
+    rows, sent = answers([program], data, reader.select(STATE)), reader.select(ACTUATION)
     assert len(rows) == len(sent) > 100
     for row, one in zip(rows, sent, strict=True):
         assert tuple(map(float, row[3:6])) == (one.decided_at_s, *one.u)

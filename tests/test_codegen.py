@@ -1,9 +1,12 @@
 """Code generation: the cache's hash sees everything, what cannot be built or loaded is reported."""
 
 import hashlib
+import io
 import os
+import re
 import shutil
 import subprocess
+import tarfile
 import tempfile
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -20,6 +23,7 @@ import bayesrace.codegen.build as build_module
 from bayesrace.cache import cache_folder
 from bayesrace.codegen.build import build, build_hash, generate
 from bayesrace.codegen.compiler import FLAGS, CompileError, Compiler, find_compiler
+from bayesrace.codegen.platforms import get_platform, host_platform
 from bayesrace.codegen.problems.driving import linearise_function
 from bayesrace.codegen.problems.problem import Problem
 from bayesrace.codegen.settings import BuildSettings
@@ -517,3 +521,41 @@ def test_cache_folder_follows_the_environment(monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.delenv("BAYESRACE_CACHE", raising=False)
     monkeypatch.setenv("XDG_CACHE_HOME", os.sep + "somewhere")
     assert cache_folder() == Path(os.sep) / "somewhere" / "bayesrace"
+
+
+# --- other platforms ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("files", "fault"),
+    [
+        ({}, "no source distribution of DAQP that fits: 'pip download"),
+        ({"daqp/csrc/include/api.h": b"int other;"}, "(api.h is not that of CasADi)"),
+        (None, "not a gzip file"),
+    ],
+)
+def test_what_is_not_daqp_is_refused(
+    tmp_path: Path, files: dict[str, bytes] | None, fault: str
+) -> None:
+    distribution = tmp_path / "daqp.tar.gz"
+    if files is None:
+        distribution.write_bytes(b"no archive")
+    else:
+        with tarfile.open(distribution, "w:gz") as archive:
+            for name, data in files.items():
+                entry = tarfile.TarInfo(name)
+                entry.size = len(data)
+                archive.addfile(entry, io.BytesIO(data))
+    with pytest.raises(InputError, match=re.escape(fault)):
+        build(SMALL, daqp=distribution)
+
+
+def test_what_another_platform_lacks_is_said_in_a_line(kinematic_artefact: Path) -> None:
+    arm = get_platform("aarch64-linux")
+    with pytest.raises(InputError, match="aarch64-linux, DAQP's C is missing: 'pip download"):
+        build(SMALL, platform=arm)
+    with pytest.raises(InputError, match="for Linux, not for x86_64-windows"):
+        build(SMALL, platform=get_platform("x86_64-windows"))
+    with pytest.raises(InputError, match="does not compile for aarch64-linux: set CC to"):
+        arm.check(kinematic_artefact / LIBRARY, find_compiler())
+    host_platform().check(kinematic_artefact / LIBRARY, find_compiler())

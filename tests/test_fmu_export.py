@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 
 from bayesrace.codegen.fmu import Variable, car_fmu, pack
 from bayesrace.codegen.fmu.archive import licence_files, third_parties
-from bayesrace.codegen.fmu.build import get_platform
+from bayesrace.codegen.platforms import get_platform
 from bayesrace.errors import InputError
 from bayesrace.plant.vehicle import PlantGuard
 from bayesrace.vehicles import Car, get_car

@@ -16,7 +16,8 @@ from fmpy import extract
 
 from bayesrace.codegen.compiler import find_compiler
 from bayesrace.codegen.fmu import car_fmu, pack
-from bayesrace.codegen.fmu.build import FLAGS, get_platform, host_platform
+from bayesrace.codegen.fmu.build import FLAGS
+from bayesrace.codegen.platforms import get_platform, host_platform
 from bayesrace.errors import InputError
 from bayesrace.vehicles import Car
 from tests.car_fmu import Version, built_in, commands, driven, packed_car, slave, unpacked_car

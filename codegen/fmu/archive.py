@@ -19,19 +19,16 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from bayesrace.codegen.fmu.build import (
     FLAGS,
-    PLATFORMS,
     FmuDefinition,
-    Platform,
     Variable,
     arguments,
     fmi_headers,
-    get_platform,
-    host_platform,
     linked_files,
     sources_of,
     write_sources,
 )
 from bayesrace.codegen.host_files import HEAD, IDENTITY_BYTES, WEIGHTS_FILE, weights_file
+from bayesrace.codegen.platforms import PLATFORMS, Platform, get_platform, host_platform
 from bayesrace.errors import InputError
 from bayesrace.files import replacing
 from bayesrace.gp.weights import Weights
@@ -90,9 +87,10 @@ def third_parties(definition: FmuDefinition, targets: Sequence[Platform]) -> lis
             _comment(casadi, "MIT No Attribution"),
         ),
     ]
-    if definition.libraries:
+    if any(name.startswith("daqp/") for name in definition.sources):
         daqp = text("casadi", "include/licenses/daqp-external/LICENSE")
-        where = "sources/libdaqpstat.a, sources/daqp, the binary"
+        library = "sources/libdaqpstat.a, " if definition.libraries else ""
+        where = f"{library}sources/daqp, the binary"
         parts.append(Part("DAQP", "casadi", "MIT", where, daqp))
     zig = [target.name for target in targets if "ziglang" in target.compiler().command]
     if names := ", ".join(zig):
@@ -243,7 +241,7 @@ def pack(definition: FmuDefinition, out: Path, platforms: Sequence[str] | None =
     if definition.libraries and foreign:
         raise InputError(
             f"'{definition.name}' links a library of this machine and cannot be built for "
-            f"{foreign}: export it there"
+            f"{foreign}: export it there, or give the artefact of 'bayesrace build --daqp'"
         )
     parts = third_parties(definition, targets)
     token, sources = sources_of(definition)

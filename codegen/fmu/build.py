@@ -5,10 +5,8 @@ The C is the model's, the FMI layer of its version (``native``), FMI's headers, 
 """
 
 import hashlib
-import platform
 from collections.abc import Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field
-from importlib.util import find_spec
 from math import inf, isfinite
 from pathlib import Path
 from typing import Final, Literal
@@ -16,13 +14,11 @@ from uuid import UUID
 
 import fmpy
 
-from bayesrace.codegen.compiler import Compiler, find_compiler
-from bayesrace.errors import InputError
-from bayesrace.processes import RUN_MODULE
+from bayesrace.codegen.platforms import Platform
 
 __all__ = [
-    "FLAGS", "NATIVE", "PLATFORMS", "FmuDefinition", "Platform", "Variable", "arguments",
-    "fmi_headers", "get_platform", "host_platform", "linked_files", "sources_of", "write_sources",
+    "FLAGS", "NATIVE", "FmuDefinition", "Variable", "arguments", "fmi_headers", "linked_files",
+    "sources_of", "write_sources",
 ]  # fmt: skip
 
 NATIVE: Final = Path(__file__).parent / "native"
@@ -114,58 +110,6 @@ class FmuDefinition:
     def libraries(self) -> bool:
         """Whether static libraries are among the sources."""
         return any(name.endswith(".a") for name in self.sources)
-
-
-@dataclass(frozen=True)
-class Platform:
-    """An operating system and processor that FMI has a folder for.
-
-    ``name``: FMI 3.0's folder, and on the command line; ``fmi2``: FMI 2.0's folder; ``suffix``: of
-    binaries; ``zig``: ziglang's target.
-    """
-
-    name: str
-    fmi2: str
-    suffix: str
-    zig: str
-
-    def folder(self, version: int) -> str:
-        """Below ``binaries/``."""
-        return self.fmi2 if version == 2 else self.name
-
-    def compiler(self) -> Compiler:
-        """What builds for it here; InputError if there is nothing."""
-        if self == host_platform():
-            return find_compiler()
-        if find_spec("ziglang") is None:
-            raise InputError(
-                f"a binary for {self.name} is cross-compiled with ziglang, which is missing: "
-                "'pip install ziglang', or leave this platform out"
-            )
-        # stripped: what it strips names temporary files, which differ from build to build
-        return Compiler((*RUN_MODULE, "ziglang", "cc", "-target", self.zig, "-s", "-g0"), "")
-
-
-_KNOWN: Final = (  # the old glibc is for the binary to load on old systems too
-    Platform("x86_64-linux", "linux64", ".so", "x86_64-linux-gnu.2.17"),
-    Platform("aarch64-linux", "aarch64-linux", ".so", "aarch64-linux-gnu.2.17"),
-    Platform("x86_64-windows", "win64", ".dll", "x86_64-windows-gnu"),
-)
-PLATFORMS: Final = {known.name: known for known in _KNOWN}
-
-
-def host_platform() -> Platform:
-    """The platform this runs on; InputError if FMI has no folder for it."""
-    machine = platform.machine().lower()
-    machine = {"amd64": "x86_64", "arm64": "aarch64"}.get(machine, machine)
-    return get_platform(f"{machine}-{platform.system().lower()}")
-
-
-def get_platform(name: str) -> Platform:
-    """By the name of FMI 3.0; InputError naming the known ones."""
-    if name not in PLATFORMS:
-        raise InputError(f"unknown platform '{name}'; known: {', '.join(PLATFORMS)}")
-    return PLATFORMS[name]
 
 
 def fmi_headers(version: int) -> list[Path]:

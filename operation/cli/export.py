@@ -23,9 +23,19 @@ __all__ = ["build", "export", "fmu"]
 def build(
     settings: "Given[BuildSettings]",
     out: Path | None = options.out_folder("Copy the artefact here."),
+    platform: str | None = options.value(
+        "What it is to run on: x86_64-linux, aarch64-linux, aarch32-linux (ARMv7) or "
+        "riscv64-linux; others than this one need --daqp, and ziglang or CC.",
+        shown="this one",
+    ),
+    daqp: Path | None = options.value(
+        "DAQP's source distribution, whose C is compiled in place of CasADi's library of it.",
+        metavar="FILE",
+    ),
 ) -> None:
     """Generate and compile a controller, or take it from the cache; prints its folder."""
     from bayesrace.codegen.build import build as make
+    from bayesrace.codegen.platforms import get_platform
     from bayesrace.integrators import PERFECT
 
     chosen = settings()
@@ -33,7 +43,8 @@ def build(
         chosen = settings(discretisation=PERFECT)
     if out is not None:
         trusted(out, make=True)  # now, as its loader would refuse it after the work
-    folder, _ = make(chosen)
+    target = None if platform is None else get_platform(platform)
+    folder, _ = make(chosen, platform=target, daqp=daqp)
     if out is not None:
         shutil.copytree(folder, out, dirs_exist_ok=True, copy_function=_replace)
         folder = out
@@ -113,8 +124,8 @@ def export_fmu(
         "cs: Co-Simulation; me: Model Exchange (the car, FMI 3.0).", "cs"
     ),
     platform: list[str] = options.value(
-        "x86_64-linux, aarch64-linux or x86_64-windows; repeatable. Others than this one need "
-        "ziglang.",
+        "x86_64-linux, aarch64-linux, aarch32-linux, riscv64-linux or x86_64-windows; repeatable. "
+        "Others than this one need ziglang.",
         (),
         shown="this one",
     ),
