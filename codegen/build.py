@@ -237,14 +237,7 @@ def build(
     Raises CompileError with the compiler's own words, InputError if there is no compiler.
     """
     cache = code_folder()
-    compiler = find_compiler()
-    if platform is not None and not platform.machine:
-        raise InputError(f"controllers are built for Linux, not for {platform.name}")
-    if platform is not None and platform != host_platform():
-        if daqp is None:
-            raise InputError(f"for {platform.name}, DAQP's C is missing: {HOW_TO_GET}")
-        if "CC" not in os.environ:
-            compiler = platform.compiler()
+    compiler = _compiler(platform, daqp)
     identity = build_hash(settings, compiler, problem, daqp)
     name = problem.name if problem else f"{settings.problem}-{settings.model}"
     target = cache / f"{name}-{identity}"
@@ -282,6 +275,17 @@ def build(
             folder.rename(target)
     note_use(made=True)
     return target, manifest
+
+
+def _compiler(platform: Platform | None, daqp: Path | None) -> Compiler:
+    """What builds for a platform, this machine's own by default."""
+    if platform is None or platform == host_platform():
+        return find_compiler()
+    if not platform.machine:
+        raise InputError(f"controllers are built for Linux, not for {platform.name}")
+    if daqp is None:
+        raise InputError(f"for {platform.name}, DAQP's C is missing: {HOW_TO_GET}")
+    return find_compiler() if "CC" in os.environ else platform.compiler()
 
 
 def _partial(target: Path) -> str:
