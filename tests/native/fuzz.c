@@ -264,6 +264,8 @@ static void observe(controller *c, int count) {
 static void predict(const controller *c) {
     double from[BR_NX], after[BR_NX], u[BR_NU];
     for (int i = 0; i < BR_NX; ++i) from[i] = number(x[i], 0.5);
+    const int at_limit = byte() % (2 * BR_NX); /* from where a prediction may go beyond it */
+    if (at_limit < BR_NX) from[at_limit] = BR_STATE_LIMIT[at_limit];
     u[0] = number(0.3, 1), u[1] = number(0, 6);
     const br_mpc_error error = br_mpc_predict(c->mpc, from, u, number(0.03, 0.07), after);
     CHECK(error == BR_OK || error == BR_ERROR_NOT_READY || error == BR_ERROR_TIME ||
