@@ -67,7 +67,7 @@ def test_the_sources_rebuild_the_binary_with_the_line_they_state(
 def test_another_platform_needs_ziglang(
     car: Car, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("bayesrace.codegen.fmu.build.find_spec", lambda name: None)
+    monkeypatch.setattr("bayesrace.codegen.platforms.find_spec", lambda name: None)
     host = host_platform().name
     other = "aarch64-linux" if host == "x86_64-linux" else "x86_64-linux"
     with pytest.raises(InputError, match=f"{other}.*pip install ziglang"):
