@@ -285,7 +285,7 @@ def _compiler(platform: Platform | None, daqp: Path | None) -> Compiler:
         raise InputError(f"controllers are built for Linux, not for {platform.name}")
     if daqp is None:
         raise InputError(f"for {platform.name}, DAQP's C is missing: {HOW_TO_GET}")
-    return find_compiler() if "CC" in os.environ else platform.compiler()
+    return find_compiler() if os.environ.get("CC") else platform.compiler()
 
 
 def _partial(target: Path) -> str:

@@ -6,14 +6,13 @@ from typing import Final
 
 from bayesrace.errors import InputError
 
-__all__ = ["HOW_TO_GET", "unpack_sources"]
+__all__ = ["HOW_TO_GET", "VERSION", "unpack_sources"]
 
-_VERSION: Final = "0.5.1"
+VERSION: Final = "0.5.1"
 """Of those that are published, the one with the headers of CasADi's copy."""
 
 HOW_TO_GET: Final = (
-    f"'pip download --no-deps --no-binary daqp daqp=={_VERSION}', then --daqp "
-    f"daqp-{_VERSION}.tar.gz"
+    f"'pip download --no-deps --no-binary daqp daqp=={VERSION}', then --daqp daqp-{VERSION}.tar.gz"
 )
 
 _LARGEST: Final = 1 << 20

@@ -15,6 +15,7 @@ from msgspec.structs import replace
 
 from bayesrace.codegen.build import HOST, build
 from bayesrace.codegen.compiler import find_compiler
+from bayesrace.codegen.daqp import VERSION
 from bayesrace.codegen.host_files import SETTINGS_FILE, export
 from bayesrace.codegen.platforms import get_platform
 from bayesrace.codegen.settings import BuildSettings
@@ -119,7 +120,7 @@ def test_a_recorded_drive_is_answered_to_the_bit(
 @pytest.fixture(scope="module")
 def daqp() -> Path:
     """Its source distribution, of the package index."""
-    wanted = "daqp==0.5.1"
+    wanted = f"daqp=={VERSION}"
 
     def download(folder: Path) -> None:
         line = [sys.executable, "-m", "pip", "download", "-q", "--no-deps", "--no-binary", "daqp"]

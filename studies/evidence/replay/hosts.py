@@ -148,12 +148,12 @@ def _c_host(setup: Setup, run: Sequence[Cycle]) -> Iterator[Answer]:
     if not run:
         return
     weights = setup.weights(run[0].sent.weights_version)
-    told = (state for cycle in run for state in cycle.states)
+    every = (state for cycle in run for state in cycle.states)
     with temporary_folder() as folder:
         host = CHost.made(
             folder, setup.artefact, setup.car, setup.track, setup.line, weights, setup.mpc
         )
-        found = host.answers(one for one in told if (one.epoch, one.run) == run[0].run)
+        found = host.answers(one for one in every if (one.epoch, one.run) == run[0].run)
     for cycle in run:
         if answer := found.get(cycle.sent.state_seq):
             yield Answer(cycle, *answer)

@@ -94,7 +94,7 @@ class Rig:
         self._car, self._vehicle = settings.driven_car, built_in_car(settings.driven_car)
         self._weights, self._run = read_weights(prepared.weights), 0
         self._made: dict[tuple[int, bool], tuple[Cycle, Cycle]] = {}
-        self._told: list[State] = []
+        self._states: list[State] = []
         """In the newest drive."""
         artefact, mpc = Artefact(prepared.artefacts[0]), MpcSettings()
         library, self._capacity = artefact.library, artefact.manifest.gp_capacity
@@ -107,7 +107,7 @@ class Rig:
     def _answered(self, cycles: tuple[Cycle, Cycle], state: State, budget_s: float) -> list[float]:
         """Of a cycle by this state: what :data:`COLUMNS` says."""
         cycle, blind = cycles
-        self._told.append(state)
+        self._states.append(state)
         estimate = _timed(lambda: cycle.driver.observe(state))
         feedback, info = _timed(lambda: cycle.decide(state.time_s, budget_s)), cycle.driver.info
         counts = (info.iterations, info.qp_iterations) if cycle.driver.decision.stepped else (0, 0)
@@ -127,7 +127,7 @@ class Rig:
             self._made[track, rough] = cycle, blind
         for each in self._made[track, rough]:
             each.driver.lost(silent=False)
-        self._told.clear()
+        self._states.clear()
         return self._made[track, rough]
 
     def _parts(self, track: int, rough: bool) -> tuple[Path, Car, Track, RaceLine, Weights]:
@@ -168,10 +168,10 @@ class Rig:
         return self._count(0)
 
     def _count(self, track: int, rough: bool = False) -> Counts:
-        told = [structs.replace(one, lockstep=True) for one in self._told]
+        states = [structs.replace(one, lockstep=True) for one in self._states]
         with temporary_folder() as folder:
             host = CHost.made(folder, *self._parts(track, rough), MpcSettings())
-            return count_instructions(host, told)
+            return count_instructions(host, states)
 
     @property
     def _budget_s(self) -> float:
