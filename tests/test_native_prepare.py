@@ -92,18 +92,35 @@ BETWEEN: dict[str, Between] = {
 }
 
 
+@pytest.mark.parametrize("elapsed", [TS, 0.0])
 @pytest.mark.parametrize("what", BETWEEN)
 def test_what_happens_in_between_is_seen(
-    make: Make, recorded: list[Problem], circuit: Circuit, car: Car, what: str
+    make: Make, recorded: list[Problem], circuit: Circuit, car: Car, what: str, elapsed: float
 ) -> None:
+    """Also by a step that comes sooner than prepared for, which goes back to the plan before."""
     prepared, plain = make(), make()
     for k, p in enumerate(recorded[:24]):
         if k == 12:
             for one in (prepared, plain):
                 BETWEEN[what](one, circuit, car)
-        assert solve(prepared, p) is solve(plain, p)
+        after = elapsed if k == 12 else TS
+        assert solve(prepared, p, elapsed_s=after) is solve(plain, p, elapsed_s=after)
         assert result(prepared) == result(plain)
         prepared.prepare()
+
+
+def test_rows_switched_off_start_no_step_from_the_plan_before_the_preparation(
+    make: Make, recorded: list[Problem], circuit: Circuit, car: Car
+) -> None:
+    """Their multipliers and places in the working set are of a problem that is no more."""
+    prepared, plain = make(), make()
+    for p in recorded[:60]:
+        for allowed, elapsed in ((True, TS), (False, 0.0)):
+            for step in (prepared, plain):
+                changed(constraints=allowed)(step, circuit, car)
+            assert solve(prepared, p, elapsed_s=elapsed) is solve(plain, p, elapsed_s=elapsed)
+            assert result(prepared) == result(plain)
+            prepared.prepare()
 
 
 def test_the_plan_of_the_last_step_stays_readable(make: Make, recorded: list[Problem]) -> None:

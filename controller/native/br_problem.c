@@ -49,9 +49,9 @@ void br_evaluate_penalties(br_mpc *mpc) {
     BR_CALL(br_penalties, BR_LIST(br_theta(&mpc->parameters)), BR_LIST(mpc->qp.penalty));
     for (int r = 0; r < BR_NR; ++r) {
         if (!BR_ROW_SOFT[r] || mpc->qp.penalty[r] > 0) continue;
-        for (int k = 0; k < BR_N; ++k) { /* off: no warm start from it */
-            mpc->qp.sense[BR_ROW(r, k)] = SOFT;
-            mpc->plan.multiplier[BR_ROW(r, k)] = 0;
+        for (int k = 0; k < BR_N; ++k) { /* off: no warm start from it, prepared or not */
+            mpc->qp.sense[BR_ROW(r, k)] = mpc->kept_sense[BR_ROW(r, k)] = SOFT;
+            mpc->plan.multiplier[BR_ROW(r, k)] = mpc->kept.multiplier[BR_ROW(r, k)] = 0;
         }
     }
 }
