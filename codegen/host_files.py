@@ -42,7 +42,7 @@ PATH_CAPACITY: Final = 8192
 _SCHEMA: Final = 3
 HEAD: Final = struct.Struct("<8sIIQQ")
 IDENTITY_BYTES: Final = 256
-_VERSION_BYTES: Final = 256
+_VERSION_BYTES: Final = 801
 
 
 def _fnv1a(data: bytes) -> int:

@@ -33,6 +33,10 @@ _HEAD: Final = """/* generated from bayesrace/messages: what a controller in C r
 """
 
 
+_MOST_FIELDS: Final = 64
+"""Of a message, which the reader in C notes as bits."""
+
+
 def messages_header() -> str:
     """The text of br_messages.h."""
     names, faults = (", ".join(f'"{one}"' for one in of) for of in (QUANTITIES, SENSOR_FAULTS))
@@ -71,6 +75,8 @@ def _structure(kind: type[Struct], name: str, schema: int) -> str:
     """A structure br_NAME and its table BR_NAME."""
     structure = f"br_{name}_message"
     members, rows = [], []
+    if len(_fields(kind)) > _MOST_FIELDS:
+        raise ValueError(f"{name} has more than {_MOST_FIELDS} fields")
     for field, of in _fields(kind).items():
         declared, row = _field(field, of, structure)
         members += declared
@@ -108,7 +114,7 @@ def _field(name: str, of: Any, structure: str) -> tuple[list[str], str]:
         return [f"int {name}"], row("FLAG", 1, 1)
     if isinstance(of, inspect.StrType):
         most = of.max_length or max(len(word) for word in _words(of.pattern or ""))
-        return [f"char {name}[{most + 1}]"], row("TEXT", 0, most)
+        return [f"char {name}[{4 * most + 1}]"], row("TEXT", 0, most)
     if isinstance(of, inspect.DictType):
         pair = cast(inspect.TupleType, of.value_type)
         value = _plain(pair.item_types[0])[0]

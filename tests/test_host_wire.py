@@ -101,7 +101,7 @@ def test_what_is_written_in_python_is_read_in_c_and_back(again: Again) -> None:
 
 
 def test_of_datagrams_that_are_damaged_both_refuse_the_same(again: Again) -> None:
-    """One byte, or several, are others; fields are left out, doubled, or of another type."""
+    """One byte, or several, are others, or the end is missing."""
     rng = random.Random(5)
     damaged = []
     for _ in range(6000):
@@ -132,7 +132,7 @@ def compare(again: Again, data: Sequence[bytes]) -> None:
 
 
 def unusual(data: bytes) -> bool:
-    """Python takes the last of two fields of a name, and texts of any bytes and any length."""
+    """Python takes the last of two fields of a name, and texts with a byte 0."""
     _, payload = msgspec.msgpack.decode(data, type=tuple[str, msgspec.Raw])
     head, content = bytes(payload)[0], msgspec.msgpack.decode(payload)
     fields = head & 15 if head < 0x90 else struct.unpack_from(">H", payload, 1)[0]
@@ -145,6 +145,27 @@ def texts_in(value: Any) -> Iterator[str]:
     elif isinstance(value, dict | list):
         for one in value.values() if isinstance(value, dict) else value:
             yield from texts_in(one)
+
+
+def test_of_states_both_want_every_field_once_and_no_other(again: Again) -> None:
+    _, state = samples()[2]
+    message = msgspec.msgpack.decode(to_datagram(STATE, state))[1]
+    fields = [one for one in message if one != "schema"]
+    changed = [{k: v for k, v in message.items() if k != name} for name in fields]
+    changed += [message | {name: None} for name in fields]
+    changed += [message | {name: "text"} for name in fields]
+    changed += [message | {"other": 1}, message | {"schema": 2}, message | {"x": [0.0] * 6}]
+    values = message["readings"][0]["values"]
+    for wrong in ({}, {"z": [1.0, 1.0]}, values | {"x": [1.0]}, values | {"x": [1.0, 0.0]}):
+        readings = [message["readings"][0] | {"values": wrong}]
+        changed.append(message | {"readings": readings})
+    data = [msgspec.msgpack.encode(["state", one]) for one in changed]
+    for one in data:
+        with pytest.raises(InputError):
+            from_datagram(one)
+    assert set(again(data)) == {b""}
+    del message["schema"]  # msgspec takes the version for granted then
+    assert again([msgspec.msgpack.encode(["state", message])]) == [b""]
 
 
 @pytest.mark.parametrize(

@@ -137,10 +137,9 @@ static int load_weights(reader *r, br_mpc *mpc, const char *identity, char *vers
     if (strncmp((const char *)r->at, identity, BR_IDENTITY_BYTES))
         return wrong(r, "was learned for another model, car or time step",
                      "train with those of this controller");
-    if (version) {
-        memcpy(version, r->at + BR_IDENTITY_BYTES, BR_VERSION_BYTES);
-        version[BR_VERSION_BYTES - 1] = 0;
-    }
+    const char *named = (const char *)r->at + BR_IDENTITY_BYTES;
+    if (!memchr(named, 0, BR_VERSION_BYTES)) return wrong(r, "has a version without end", ANEW);
+    if (version) memcpy(version, named, BR_VERSION_BYTES);
     r->at += BR_IDENTITY_BYTES + BR_VERSION_BYTES;
     r->left -= BR_IDENTITY_BYTES + BR_VERSION_BYTES;
     const size_t each = BR_NZ + (size_t)BR_GP_CAPACITY * (BR_NZ + 1);

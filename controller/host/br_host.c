@@ -9,21 +9,20 @@
 
 #include "br_host.h"
 
-#define SILENT_NS \
-    1000000000            /* without a state for so long it waits for a plant, and sends nothing */
-#define BEAT_NS 100000000 /* between two looks around while it waits */
-#define LEAD 0.1          /* share of the period by which it wakes before a release, ... */
-#define LEAD_NS 300000    /* ... and at most */
-#define REHEARSAL_NS 700000 /* how much sooner, to rehearse a cycle, ... */
-#define COLD_NS 5000000     /* ... where the period is long enough for caches to go cold */
-#define WAY 0.05            /* share of the period that the actuation's way is left alone, ... */
-#define WAY_NS 1000000      /* ... and at most */
-#define ROOM 2.0            /* time that a late cycle must have, in times of the one before */
+#define SILENT_NS 1000000000 /* without a state for so long it waits for another plant */
+#define IDLE_NS 100000000    /* longest wait while there is none */
+#define LEAD 0.1             /* share of the period by which it wakes before a release, ... */
+#define LEAD_NS 300000       /* ... and at most */
+#define REHEARSAL_NS 700000  /* how much sooner, to rehearse a cycle, ... */
+#define COLD_NS 5000000      /* ... where the period is long enough for caches to go cold */
+#define WAY 0.05       /* pause before the preparation, so that the actuation gets the CPU, ... */
+#define WAY_NS 1000000 /* ... as a share of the period, and at most */
+#define ROOM 2.0       /* time that a late cycle must have, in times of the one before */
 #define BRAKING_NS 15000000 /* between two braking plans */
-#define NEWEST 64           /* states that are looked through for the newest */
+#define NEWEST 1024         /* states that are looked through for the newest */
 
 /* What has come of looking for a state. */
-typedef enum { LINK_ENDED = -1, NOTHING, NO_NEW_STATE, NEW_STATE } taken;
+typedef enum { NOTHING, NO_NEW_STATE, NEW_STATE } arrival;
 
 /* --- start --- */
 
@@ -59,11 +58,20 @@ int br_host_open(br_host *host, const char *folder, const char *link, double rat
     if (br_files_load(host->mpc, folder, BR_MODEL_IDENTITY, host->weights, why, sizeof why) ||
         br_files_settings(folder, &parameters, &driving, &estimation, why, sizeof why))
         return failed(text, size, folder, why);
+    if (br_wire_characters(host->weights, strlen(host->weights)) < 0)
+        return failed(text, size, folder, "weights.bin has a version that is no text");
     error = make(host, &parameters, &driving, &estimation);
     if (error) return failed(text, size, folder, br_mpc_error_text(error));
     host->schedule.period_ns = llrint(1e9 / rate_hz);
-    if (br_link_open(&host->link, link, why, sizeof why)) return failed(text, size, "link", why);
+    if (br_link_open(&host->link, link, &host->stopping, why, sizeof why))
+        return failed(text, size, "link", why);
     return 0;
+}
+
+void br_host_close(br_host *host) {
+    br_link_close(&host->link);
+    free(host->cycle);
+    free(host->mpc);
 }
 
 /* --- states --- */
@@ -114,8 +122,9 @@ static void measure(br_host *host, const br_state_message *state, br_instruments
     if (state->estimated) take_readings(host, state, known);
 }
 
-/* The cycle's verdict on a state; a new one is the one that is driven on, for its sender. */
-static taken observe(br_host *host, const br_state_message *state, int64_t arrived_ns) {
+/* The cycle's verdict on a state; a new one is driven on, for its sender. */
+static arrival observe(br_host *host, const br_state_message *state, const br_address *from,
+                       int64_t arrived_ns) {
     const br_state_message *newest = &host->state;
     const int begins =
         !host->has_state || state->epoch != newest->epoch || state->run != newest->run;
@@ -125,10 +134,12 @@ static taken observe(br_host *host, const br_state_message *state, int64_t arriv
     const br_reception reception = br_cycle_observe(host->cycle, &host->measured);
     if (!begins || reception == BR_STATE_NEW) host->instruments = known;
     if (reception != BR_STATE_NEW) {
-        if (state != &host->left) host->left = *state;
-        host->has_left = 1;
+        if (state != &host->unanswered) host->unanswered = *state;
+        host->unanswered_from = *from;
+        host->has_unanswered = 1;
         return NO_NEW_STATE;
     }
+    host->link.peer = *from;
     host->state = *state;
     host->has_state = 1;
     host->timing.taken += 1;
@@ -136,67 +147,88 @@ static taken observe(br_host *host, const br_state_message *state, int64_t arriv
     return NEW_STATE;
 }
 
-/* The next datagram, waited for until then. */
-static taken take(br_host *host, int64_t until_ns) {
+static int silent(const br_host *host) { return br_now_ns() - host->timing.arrived_ns > SILENT_NS; }
+
+/* Whether a datagram is from another than the plant that is driven for: until that has ended its
+ * run or is silent, nobody else has a say. */
+static int from_other(const br_host *host) {
+    if (!host->has_state || host->state.final || silent(host)) return 0;
+    return !br_same_address(&host->link.from, &host->link.peer);
+}
+
+static int read_state(br_host *host, size_t size) {
     char topic[32];
     size_t payload;
-    const long size = br_link_receive(&host->link, until_ns, host->datagram, sizeof host->datagram);
-    if (size <= 0) return size < 0 ? LINK_ENDED : NOTHING;
-    const int64_t arrived_ns = br_now_ns();
     const uint8_t *data = host->datagram;
-    const char *of = br_wire_topic(data, (size_t)size, &payload, topic);
-    if (!of || strcmp(of, BR_STATE_TABLE.topic) ||
-        br_wire_read(&BR_STATE_TABLE, data + payload, (size_t)size - payload, &host->incoming) ||
-        host->incoming.actuation_delays_count % 3) {
+    const char *of = br_wire_topic(data, size, &payload, topic);
+    if (!of || strcmp(of, BR_STATE_TABLE.topic)) return -1;
+    if (br_wire_read(&BR_STATE_TABLE, data + payload, size - payload, &host->incoming)) return -1;
+    return host->incoming.actuation_delays_count % 3 ? -1 : 0; /* whole rows */
+}
+
+/* The next datagram, waited for until then. The end of the link ends the loop. */
+static arrival receive_state(br_host *host, int64_t until_ns) {
+    const long size = br_link_receive(&host->link, until_ns, host->datagram, sizeof host->datagram);
+    host->stopping |= size == BR_LINK_ENDED;
+    if (size < 0) return NOTHING;
+    const int64_t arrived_ns = br_now_ns();
+    if (from_other(host)) {
+        host->timing.from_others += 1;
+        return NO_NEW_STATE;
+    }
+    if (read_state(host, (size_t)size)) {
         host->timing.refused += 1;
         return NO_NEW_STATE;
     }
     host->timing.decode_us = (double)(br_now_ns() - arrived_ns) * 1e-3;
-    const taken found = observe(host, &host->incoming, arrived_ns);
-    if (found == NEW_STATE) br_link_follow(&host->link);
-    return found;
+    return observe(host, &host->incoming, &host->link.from, arrived_ns);
 }
-
-/* As take, and the end of the link ends the loop. */
-static taken look(br_host *host, int64_t until_ns) {
-    const taken found = take(host, until_ns);
-    if (found == LINK_ENDED) host->stopping = 1;
-    return found;
-}
-
-static int silent(const br_host *host) { return br_now_ns() - host->timing.arrived_ns > SILENT_NS; }
 
 /* After silence: a state that was not driven on, to which its plant may want an answer. */
-static int left_over(br_host *host) {
-    if (!silent(host) || !br_cycle_forget(host->cycle) || !host->has_left) return 0;
-    return observe(host, &host->left, br_now_ns()) == NEW_STATE;
+static int take_unanswered(br_host *host) {
+    if (!silent(host) || !br_cycle_forget(host->cycle) || !host->has_unanswered) return 0;
+    const br_address from = host->unanswered_from;
+    return observe(host, &host->unanswered, &from, br_now_ns()) == NEW_STATE;
 }
 
 /* Ends a loop, for want of states or with one that is not for it; whether there is one to drive. */
-static int leave(br_host *host, int fresh) {
+static int end_run(br_host *host, int fresh) {
     br_cycle_end(host->cycle);
-    return fresh || left_over(host);
+    return fresh || take_unanswered(host);
 }
 
 static int await_state(br_host *host) {
-    const taken found = look(host, br_now_ns() + BEAT_NS);
-    return found == NEW_STATE || (found == NOTHING && left_over(host));
+    return receive_state(host, br_now_ns() + IDLE_NS) == NEW_STATE || take_unanswered(host);
 }
 
 /* --- a cycle --- */
 
 static const br_counters *counters(const br_host *host) { return br_cycle_counters(host->cycle); }
 
+static int64_t part_ns(const br_host *host, double share) {
+    return llrint(share * (double)host->schedule.period_ns);
+}
+
+/* When the budget of the cycles after this release is used up. */
+static int64_t budget_end_ns(const br_host *host) {
+    return host->schedule.release_ns + part_ns(host, host->budget);
+}
+
 /* Decides, and sends what it has decided. */
 static void cycle(br_host *host, double decided_at_s, double budget_s, double spent_s) {
+    br_timing *timing = &host->timing;
+    const int64_t begin_ns = br_now_ns();
     const br_mpc_error error =
         br_cycle_decide(host->cycle, NULL, decided_at_s, budget_s, spent_s, &host->decision);
     if (error) return; /* without a state there is none to answer */
-    host->timing.overruns += budget_s > 0 && host->decision.late_s > 0;
+    const int64_t decided_ns = br_now_ns();
+    timing->solve_us = (double)(decided_ns - begin_ns) * 1e-3;
+    timing->overruns += budget_s > 0 && decided_ns > budget_end_ns(host);
+    if (host->decision.status == BR_STEP_FAILED) host->error = host->decision.error;
     br_send_actuation(host);
     const int64_t deadline_ns = host->schedule.release_ns + host->schedule.period_ns;
-    host->timing.missed = budget_s > 0 && br_now_ns() > deadline_ns;
-    host->timing.misses += host->timing.missed;
+    timing->missed = budget_s > 0 && br_now_ns() > deadline_ns;
+    timing->misses += timing->missed;
     br_send_telemetry(host);
 }
 
@@ -225,22 +257,14 @@ static int lockstep(br_host *host) {
             cycle(host, counters(host)->time_s, 0, 0);
             prepare(host, counters(host)->interval_s, 0);
         }
-        fresh = look(host, br_now_ns() + BEAT_NS) == NEW_STATE;
+        fresh = receive_state(host, br_now_ns() + IDLE_NS) == NEW_STATE;
     }
-    return leave(host, fresh);
+    return end_run(host, fresh);
 }
 
 /* --- real time --- */
 
-static int64_t part_ns(const br_host *host, double share) {
-    return llrint(share * (double)host->schedule.period_ns);
-}
-
 static int64_t smaller(int64_t a, int64_t b) { return a < b ? a : b; }
-
-static int64_t budget_end_ns(const br_host *host) {
-    return host->schedule.release_ns + part_ns(host, host->budget);
-}
 
 static int missing(const br_host *host) {
     const br_counters *count = counters(host);
@@ -275,8 +299,8 @@ static int newest_state(br_host *host, int64_t until_ns) {
     int fresh = 0;
     for (int i = 0; i < NEWEST && !host->stopping; ++i) {
         const int waits = !fresh || missing(host) == 1;
-        const taken found = look(host, waits ? until_ns : 0);
-        if (found <= NOTHING) break;
+        const arrival found = receive_state(host, waits ? until_ns : 0);
+        if (found == NOTHING) break;
         fresh |= found == NEW_STATE;
     }
     if (!fresh) return 0;
@@ -316,6 +340,14 @@ static void prepare_next(br_host *host) {
         prepare(host, (double)(next_ns - host->timing.released_ns) * 1e-9, (double)left_ns * 1e-9);
 }
 
+/* Uses what the cycle will use, without effect: message, cycle, message. */
+static void rehearse(br_host *host) {
+    const size_t size = br_wire_write(&BR_STATE_TABLE, &host->state, host->datagram, BR_DATAGRAM);
+    read_state(host, size);
+    br_cycle_rehearse(host->cycle);
+    br_wire_write(&BR_ACTUATION_TABLE, &host->actuation, host->datagram, BR_DATAGRAM);
+}
+
 /* Sleeps until shortly before the release, then looks for the state that is due. */
 static int next_state(br_host *host) {
     const br_schedule *schedule = &host->schedule;
@@ -324,7 +356,7 @@ static int next_state(br_host *host) {
     const int64_t wake_ns = schedule->release_ns - lead_ns;
     sleep_until(wake_ns);
     host->timing.wake_us = fmax((double)(br_now_ns() - wake_ns) * 1e-3, 0);
-    if (rehearses) br_cycle_rehearse(host->cycle);
+    if (rehearses) rehearse(host);
     return newest_state(host,
                         missing(host) ? br_schedule_window_end_ns(schedule) : schedule->release_ns);
 }
@@ -349,7 +381,7 @@ static int real_time(br_host *host) {
         host->timing.skipped += br_schedule_advance(schedule, br_now_ns());
         fresh = next_state(host);
     }
-    return leave(host, fresh);
+    return end_run(host, fresh);
 }
 
 void br_host_serve(br_host *host) {

@@ -1,8 +1,7 @@
 /* The loop of a controller without Python: states in, actuations out, at a fixed rate in real time,
  * one answer to each state in lockstep. The same rules as controller/process.py, which says why.
  *
- * Everything lives in one block of memory; after br_host_open nothing is allocated, and nothing is
- * written but what the link sends.
+ * After br_host_open nothing is allocated, and nothing is written but what the link sends.
  */
 #ifndef BR_HOST_H
 #define BR_HOST_H
@@ -16,6 +15,8 @@
 #include "br_transport.h"
 
 _Static_assert(BR_NX == BR_QUANTITIES && BR_NU == 2, "messages are those of a car");
+_Static_assert(sizeof(((br_actuation_message *)0)->weights_version) == BR_VERSION_BYTES,
+               "a version of a file fits into messages");
 
 /* Numbers of the instruments of a run, by name, in the order in which they have reported. */
 typedef struct {
@@ -26,10 +27,12 @@ typedef struct {
 /* Times of the cycle at hand, as in the telemetry, and what the loop has counted. */
 typedef struct {
     int64_t released_ns, arrived_ns;
-    double wake_us, decode_us, prepare_us, encode_us, prepared_s;
+    double wake_us, decode_us, prepare_us, solve_us, encode_us, prepared_s;
     int missed, prepared_refusals, prepared_refused[BR_REFUSALS];
     int64_t ticks, skipped, misses, overruns, late_states, taken, reported;
-    int64_t refused, readings_left_out; /* datagrams that are no message; readings of too many */
+    int64_t refused, from_others, readings_left_out; /* datagrams that are no state; those from
+                                                      * others than the plant that is driven for;
+                                                      * readings of too many instruments */
 } br_timing;
 
 typedef struct {
@@ -41,10 +44,13 @@ typedef struct {
     int telemetry;                  /* 1: it is sent */
     char weights[BR_VERSION_BYTES]; /* version of those in use */
     volatile sig_atomic_t stopping; /* set it from anywhere */
+    int error;                      /* br_mpc_error of the last step that was broken */
     br_timing timing;
     br_instruments instruments;
-    br_state_message state, incoming, left; /* the newest that counts; the last that does not */
-    int has_state, has_left;
+    br_state_message state, incoming,
+        unanswered; /* the newest that counts; the last that does not */
+    br_address unanswered_from;
+    int has_state, has_unanswered;
     int64_t actuations, reports, brakings, braked_ns; /* sent so far; when the last plan was */
     br_measured measured;
     br_decision decision;
@@ -61,6 +67,8 @@ typedef struct {
  * sentence in text. */
 int br_host_open(br_host *host, const char *folder, const char *link, double rate_hz, char *text,
                  size_t size);
+
+void br_host_close(br_host *host);
 
 /* Until host->stopping, or until nothing can come any more. */
 void br_host_serve(br_host *host);

@@ -33,7 +33,7 @@ void br_send_actuation(br_host *host) {
 }
 
 static int rounded(const double *from, int count, double *to) {
-    for (int i = 0; i < count; ++i) to[i] = rint(from[i] * 1e6) / 1e6;
+    for (int i = 0; i < count; ++i) to[i] = rint(from[i] * SCALE) / SCALE;
     return count;
 }
 
@@ -59,12 +59,9 @@ static double known(double value, double otherwise) { return isfinite(value) ? v
 
 /* For viewing, to six digits; nothing of it if any of it is no number. */
 static int viewed(const double *plan, int count, double *out) {
-    for (int i = 0; i < count; ++i) {
-        const double scaled = rint(plan[i] * SCALE);
-        if (!(fabs(scaled) <= LARGEST * SCALE)) return 0;
-        out[i] = scaled / SCALE;
-    }
-    return count;
+    for (int i = 0; i < count; ++i)
+        if (!(fabs(plan[i]) <= LARGEST)) return 0;
+    return rounded(plan, count, out);
 }
 
 /* What has come of the step, if one was made. */
@@ -120,7 +117,7 @@ static void report_timing(br_host *host, br_telemetry_message *m) {
     m->wake_us = timing->wake_us;
     m->decode_us = timing->decode_us;
     m->prepare_us = timing->prepare_us;
-    m->solve_us = host->decision.step_us;
+    m->solve_us = host->decision.step_us > 0 ? host->decision.step_us : timing->solve_us;
     m->encode_us = timing->encode_us;
     m->states = timing->taken - timing->reported;
     timing->reported = timing->taken;

@@ -4,35 +4,48 @@
  *   unix:PATH          the same on a Unix socket, between processes of one machine
  *   stdio              standard input and output, each datagram behind its length (u32, big-endian)
  *
- * None blocks but in receive, where a timeout says for how long, and stdio, which is for files and
- * pipes: there receive waits for the whole datagram.
+ * None waits but in br_link_receive, which says for how long, and stdio, which is for files and
+ * pipes: what has begun to come or go there is waited for.
  */
 #ifndef BR_TRANSPORT_H
 #define BR_TRANSPORT_H
 
+#include <signal.h>
 #include <stddef.h>
 #include <stdint.h>
 #include <sys/socket.h>
+#include <sys/types.h>
 #include <sys/un.h>
 
 #define BR_DATAGRAM 65536 /* longer ones are cut off, and no message then */
 
+/* What is received in place of a datagram's length. */
+enum { BR_LINK_NOTHING = -1, BR_LINK_ENDED = -2 };
+
 typedef struct br_transport br_transport;
 
 typedef struct {
+    struct sockaddr_storage at;
+    socklen_t size; /* 0: nobody */
+} br_address;
+
+typedef struct {
     const br_transport *by;
+    const volatile sig_atomic_t *stopping; /* set: nothing is waited for any more */
     int in, out;
-    struct sockaddr_storage from, peer; /* of the newest datagram; of whom the answers are for */
-    socklen_t from_size, peer_size;
-    char path[sizeof(((struct sockaddr_un *)0)->sun_path)]; /* to be removed; empty: none */
-    int64_t unsent;                                         /* datagrams that could not be sent */
+    br_address from, peer;  /* of the newest datagram; of whom the answers are for */
+    struct sockaddr_un own; /* of a Unix socket, whose file is removed at the end, ... */
+    dev_t device;           /* ... if it is still this one */
+    ino_t inode;
+    int broken;     /* nothing can be sent any more */
+    int64_t unsent; /* datagrams that could not be sent */
 } br_link;
 
 struct br_transport {
     const char *name;
     /* Opens what is behind the colon. 0, or -1 and a sentence in text. */
     int (*open)(br_link *link, const char *where, char *text, size_t size);
-    /* Length of the next datagram; 0: there is none, -1: there will be none any more. */
+    /* Length of the next datagram, which may be 0; or one of the above. */
     long (*receive)(br_link *link, uint8_t *data, size_t size);
     /* To the peer. 0, or -1 if it could not be sent. */
     int (*send)(br_link *link, const uint8_t *data, size_t size);
@@ -42,7 +55,8 @@ struct br_transport {
 };
 
 /* A link by its name as above. 0, or -1 and a sentence in text. */
-int br_link_open(br_link *link, const char *name, char *text, size_t size);
+int br_link_open(br_link *link, const char *name, const volatile sig_atomic_t *stopping, char *text,
+                 size_t size);
 
 /* The next datagram, waited for until the monotonic clock says until_ns (0: only looked for). As
  * receive. */
@@ -50,8 +64,8 @@ long br_link_receive(br_link *link, int64_t until_ns, uint8_t *data, size_t size
 
 void br_link_send(br_link *link, const uint8_t *data, size_t size);
 
-/* Answers go to whom the newest datagram came from. */
-void br_link_follow(br_link *link);
+/* Whether two datagrams came from one address; of a stream all do. */
+int br_same_address(const br_address *one, const br_address *other);
 
 void br_link_close(br_link *link);
 

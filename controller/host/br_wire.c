@@ -151,33 +151,41 @@ static int take_flag(reader *r, int *value) {
     return 0;
 }
 
-/* Whether it is UTF-8: no longer forms than needed, no surrogates. */
-static int is_utf8(const char *text, size_t size) {
-    for (size_t i = 0; i < size;) {
+/* No longer forms than needed, no surrogates. */
+int br_wire_characters(const char *text, size_t bytes) {
+    static const uint32_t least[] = {0, 0x80, 0x800, 0x10000};
+    int count = 0;
+    for (size_t i = 0; i < bytes; ++count) {
         const uint8_t head = (uint8_t)text[i++];
         if (head < 0x80) continue;
         const unsigned more = head < 0xe0 ? 1 : head < 0xf0 ? 2 : 3;
-        static const uint32_t least[] = {0, 0x80, 0x800, 0x10000};
-        if (head < 0xc2 || head > 0xf4 || size - i < more) return 0;
+        if (head < 0xc2 || head > 0xf4 || bytes - i < more) return -1;
         uint32_t code = head & (0x3fu >> more);
         for (unsigned k = 0; k < more; ++k, ++i) {
             const uint8_t next = (uint8_t)text[i];
-            if ((next & 0xc0) != 0x80) return 0;
+            if ((next & 0xc0) != 0x80) return -1;
             code = code << 6 | (next & 0x3fu);
         }
-        if (code < least[more] || code > 0x10ffff || (code >= 0xd800 && code < 0xe000)) return 0;
+        if (code < least[more] || code > 0x10ffff || (code >= 0xd800 && code < 0xe000)) return -1;
     }
-    return 1;
+    return count;
+}
+
+static int fits(const br_wire_field *field, const char *text, size_t bytes) {
+    const int count = bytes <= 4 * (size_t)field->most ? br_wire_characters(text, bytes) : -1;
+    return count >= field->least && count <= field->most;
 }
 
 static int take_text(reader *r, const br_wire_field *field, char *text) {
     item found;
-    if (read_item(r, IS_TEXT, &found) || found.count > (size_t)field->most) return -1;
-    if (memchr(found.text, 0, found.count) || !is_utf8(found.text, found.count)) return -1;
+    if (read_item(r, IS_TEXT, &found) || !fits(field, found.text, found.count)) return -1;
+    if (memchr(found.text, 0, found.count)) return -1;
     memcpy(text, found.text, found.count);
     text[found.count] = 0;
     return 0;
 }
+
+static const br_wire_field deviation = {.low = BR_DEVIATION_LOW, .high = BR_DEVIATION_HIGH};
 
 static const char *const quantities[BR_QUANTITIES] = {BR_QUANTITY_NAMES};
 
@@ -188,7 +196,6 @@ static int quantity(const item *name) {
 }
 
 static int take_measures(reader *r, const br_wire_field *field, br_measures *measures) {
-    static const br_wire_field deviation = {.low = BR_DEVIATION_LOW, .high = BR_DEVIATION_HIGH};
     item map, name, pair;
     int known = 0;
     if (read_item(r, IS_MAP, &map) || !map.count || map.count > BR_QUANTITIES) return -1;
@@ -366,7 +373,6 @@ static void put_array(writer *w, const br_wire_field *field, const char *message
 }
 
 static void put_measures(writer *w, const br_wire_field *field, const br_measures *measures) {
-    static const br_wire_field deviation = {.low = BR_DEVIATION_LOW, .high = BR_DEVIATION_HIGH};
     put_count(w, 0x80, 15, 0xde, (size_t)measures->count);
     for (int i = 0; i < measures->count; ++i) {
         put_text(w, quantities[measures->of[i]]);
@@ -389,6 +395,7 @@ static void put_field(writer *w, const br_wire_field *field, const char *message
         put(w, *(const int *)at ? 0xc3 : 0xc2, 0, 0);
         break;
     case BR_TEXT:
+        w->failed |= !fits(field, at, strlen(at));
         put_text(w, at);
         break;
     case BR_MEASURES:

@@ -14,7 +14,7 @@ typedef enum {
     BR_WHOLE,   /* int64_t */
     BR_REAL,    /* double */
     BR_FLAG,    /* int, 0 or 1 */
-    BR_TEXT,    /* char[most + 1], of UTF-8: at most so many bytes, none of them 0 */
+    BR_TEXT,    /* char[4 * most + 1], of UTF-8: at most so many characters, none of them 0 */
     BR_WHOLES,  /* int64_t[most] */
     BR_REALS,   /* double[most] */
     BR_RECORDS, /* most structures of their own table */
@@ -58,6 +58,9 @@ const char *br_wire_topic(const uint8_t *data, size_t size, size_t *payload, cha
 
 /* 0, or -1 if the data are not such a message; the structure then holds anything. */
 int br_wire_read(const br_wire_table *table, const uint8_t *data, size_t size, void *message);
+
+/* Characters of a text; -1: it is not UTF-8. */
+int br_wire_characters(const char *text, size_t bytes);
 
 /* The datagram's length; 0: it does not fit, or the message breaks its limits. */
 size_t br_wire_write(const br_wire_table *table, const void *message, uint8_t *data, size_t size);

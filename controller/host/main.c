@@ -35,14 +35,14 @@ static int failed(const char *what, const char *why) {
 /* --- options --- */
 
 typedef struct {
-    double rate_hz, fifo, cpu;
-    int lock_memory;
+    double rate_hz, budget, fifo, cpu;
+    int telemetry, lock_memory;
 } options;
 
 typedef struct {
     const char *name;
     double *number, low, high; /* of an option with a number, or */
-    int *flag;
+    int *flag, whole;
     const char *meaning;
 } option;
 
@@ -55,15 +55,26 @@ static int usage(const option *known, int count) {
     return 2;
 }
 
+/* The number behind an option; 0, or -1 if it is none, or not within the option's limits. */
+static int read_number(const option *of, const char *word) {
+    char *end = NULL;
+    const double value = word ? strtod(word, &end) : 0;
+    if (!end || end == word || *end || !(value >= of->low && value <= of->high)) return -1;
+    if (of->whole && value != floor(value)) return -1;
+    *of->number = value;
+    return 0;
+}
+
 /* The options behind the arguments; 0, or an exit code. */
 static int read_options(int argc, char **argv, options *o) {
     const option known[] = {
-        {"--rate", &o->rate_hz, 1, 500, NULL, "HZ: in real time, 1 to 500; default 50"},
-        {"--budget", &host.budget, 0.05, 1, NULL, "SHARE: of the period for a cycle; default 0.8"},
-        {"--telemetry", NULL, 0, 0, &host.telemetry, "send plan, residuals and timing as well"},
-        {"--fifo", &o->fifo, 1, 99, NULL, "PRIORITY: by SCHED_FIFO"},
-        {"--cpu", &o->cpu, 0, 1023, NULL, "N: run on that processor alone"},
-        {"--lock-memory", NULL, 0, 0, &o->lock_memory, "lock the memory against paging"}};
+        {"--rate", &o->rate_hz, 1, 500, NULL, 0, "HZ: in real time, 1 to 500; default 50"},
+        {"--budget", &o->budget, 0.05, 1, NULL, 0,
+         "SHARE: of the period that a cycle may take, 0.05 to 1; default 0.8"},
+        {"--telemetry", NULL, 0, 0, &o->telemetry, 0, "send plan, residuals and timing as well"},
+        {"--fifo", &o->fifo, 1, 99, NULL, 1, "PRIORITY: by SCHED_FIFO, 1 to 99"},
+        {"--cpu", &o->cpu, 0, CPU_SETSIZE - 1, NULL, 1, "N: run on that processor alone"},
+        {"--lock-memory", NULL, 0, 0, &o->lock_memory, 0, "lock the memory against paging"}};
     const int count = sizeof known / sizeof known[0];
     if (argc < 3) return usage(known, count);
     for (int i = 3; i < argc; ++i) {
@@ -75,15 +86,10 @@ static int read_options(int argc, char **argv, options *o) {
         }
         if (known[k].flag) {
             *known[k].flag = 1;
-            continue;
-        }
-        char *end = NULL;
-        const double value = i + 1 < argc ? strtod(argv[++i], &end) : -1;
-        if (!end || end == argv[i] || *end || !(value >= known[k].low && value <= known[k].high)) {
+        } else if (read_number(&known[k], argv[++i])) { /* behind the last word is NULL */
             failed(known[k].name, known[k].meaning);
             return 2;
         }
-        *known[k].number = value;
     }
     return 0;
 }
@@ -107,37 +113,55 @@ static void prepare_process(const options *o) {
 
 static void report(void) {
     const br_timing *timing = &host.timing;
-    const int64_t *levels = br_cycle_counters(host.cycle)->levels;
-    fprintf(stderr,
-            NAME ": states %lld, cycles %lld (solution %lld, shifted plan %lld, brake %lld, stop "
-                 "%lld), skipped %lld, deadline misses %lld, overruns %lld, late states %lld, "
-                 "datagrams refused %lld, unsent %lld\n",
-            (long long)timing->taken, (long long)timing->ticks, (long long)levels[BR_SOLUTION],
-            (long long)levels[BR_SHIFTED_PLAN], (long long)levels[BR_BRAKE],
-            (long long)levels[BR_STOP], (long long)timing->skipped, (long long)timing->misses,
-            (long long)timing->overruns, (long long)timing->late_states, (long long)timing->refused,
-            (long long)host.link.unsent);
+    const br_counters *count = br_cycle_counters(host.cycle);
+    const struct {
+        const char *what;
+        int64_t number;
+    } counts[] = {
+        {"states", timing->taken},
+        {"stale", count->stale},
+        {"of other runs", count->foreign},
+        {"datagrams refused", timing->refused},
+        {"from others", timing->from_others},
+        {"readings left out", timing->readings_left_out},
+        {"cycles", timing->ticks},
+        {"solution", count->levels[BR_SOLUTION]},
+        {"shifted plan", count->levels[BR_SHIFTED_PLAN]},
+        {"brake", count->levels[BR_BRAKE]},
+        {"stop", count->levels[BR_STOP]},
+        {"steps failed", count->failed},
+        {"skipped", timing->skipped},
+        {"deadline misses", timing->misses},
+        {"overruns", timing->overruns},
+        {"late states", timing->late_states},
+        {"unsent", host.link.unsent},
+    };
+    fprintf(stderr, NAME ":");
+    for (size_t i = 0; i < sizeof counts / sizeof counts[0]; ++i)
+        fprintf(stderr, "%s %s %lld", i ? "," : "", counts[i].what, (long long)counts[i].number);
+    fprintf(stderr, "\n");
+    if (count->failed) failed("last failed step", br_mpc_error_text((br_mpc_error)host.error));
 }
 
 int main(int argc, char **argv) {
     char why[512];
-    options o = {.rate_hz = 50, .cpu = -1};
-    host.budget = 0.8;
+    options o = {.rate_hz = 50, .budget = 0.8, .cpu = -1};
     const int code = read_options(argc, argv, &o);
     if (code) return code;
     const struct sigaction ends = {.sa_handler = stop}; /* and waits are cut short */
     sigaction(SIGINT, &ends, NULL);
     sigaction(SIGTERM, &ends, NULL);
+    signal(SIGPIPE, SIG_IGN); /* who no longer reads does not end it at once */
     if (br_host_open(&host, argv[1], argv[2], o.rate_hz, why, sizeof why)) {
         fprintf(stderr, NAME ": %s\n", why);
         return 1;
     }
+    host.budget = o.budget;
+    host.telemetry = o.telemetry;
     prepare_process(&o);
     fprintf(stderr, NAME ": ready at %s\n", argv[2]);
     br_host_serve(&host);
-    br_link_close(&host.link);
     report();
-    free(host.cycle);
-    free(host.mpc);
+    br_host_close(&host);
     return 0;
 }

@@ -14,6 +14,8 @@ from bayesrace.trusted_files import trusted
 
 if TYPE_CHECKING:
     from bayesrace.codegen.settings import BuildSettings
+    from bayesrace.controller.settings import MpcSettings
+    from bayesrace.gp.weights import Weights
     from bayesrace.raceline import RaceLine
     from bayesrace.tracks import Track
     from bayesrace.vehicles import Car
@@ -34,7 +36,7 @@ def build(
         "DAQP's source distribution, whose C is compiled in place of CasADi's library of it.",
         metavar="FILE",
     ),
-    host: bool = options.flag("--host", "Build the controller without Python, too: a program."),
+    host: bool = options.flag("--host", "Add the controller without Python: a program."),
 ) -> None:
     """Generate and compile a controller, or take it from the cache; prints its folder."""
     from bayesrace.codegen.build import artefact_compiler
@@ -45,6 +47,8 @@ def build(
     chosen = settings()
     if chosen.model == "dynamic":
         chosen = settings(discretisation=PERFECT)
+    if host and out is None:
+        raise InputError("--host: the program goes into the folder of --out; give one")
     if out is not None:
         trusted(out, make=True)  # now, as its loader would refuse it after the work
     target = None if platform is None else get_platform(platform)
@@ -77,33 +81,38 @@ def export(
     car: str = options.CAR,
 ) -> None:
     """Write racing line, weights and settings for the controller without Python."""
-    from bayesrace.controller.assembly import read_checked, read_settings
-    from bayesrace.controller.settings import MpcSettings
     from bayesrace.manifest import read_manifest
     from bayesrace.operation.host import export_for
     from bayesrace.vehicles import get_car
 
     parameters = get_car(car)
-    course, line, folder = _controller(parameters, track, raceline, artefact)
-    read_manifest(folder).check_car(parameters, folder)
-    learned = None if weights is None else read_checked(weights, folder, parameters)
-    settings = read_settings(mpc, MpcSettings)
-    export_for(out, folder, parameters, course, line, learned, settings)
+    given = _controller(parameters, track, raceline, weights, mpc, artefact)
+    read_manifest(given[0]).check_car(parameters, given[0])
+    export_for(out, *given)
     typer.echo(f"{track or parameters.race_track}, {parameters.name}: {out}")
 
 
 def _controller(
-    car: "Car", track: str, raceline: Path | None, artefact: Path | None
-) -> "tuple[Track, RaceLine, Path]":
-    """Track, racing line and artefact."""
+    car: "Car",
+    track: str,
+    raceline: Path | None,
+    weights: Path | None,
+    mpc: Path | None,
+    artefact: Path | None,
+) -> "tuple[Path, Car, Track, RaceLine, Weights | None, MpcSettings]":
+    """A controller's artefact and what it drives by."""
     from bayesrace.codegen.build import build as make
     from bayesrace.codegen.settings import BuildSettings
+    from bayesrace.controller.assembly import read_checked, read_settings
+    from bayesrace.controller.settings import MpcSettings
     from bayesrace.raceline import racing_line, read_raceline_for
     from bayesrace.tracks import load_track
 
     course = load_track(track or car.race_track, car.width_m)
     line = read_raceline_for(raceline, course, car) if raceline else racing_line(course, car)
-    return course, line, artefact or make(BuildSettings(car=car))[0]
+    folder = artefact or make(BuildSettings(car=car))[0]
+    learned = None if weights is None else read_checked(weights, folder, car)
+    return folder, car, course, line, learned, read_settings(mpc, MpcSettings)
 
 
 def export_fmu(
@@ -149,17 +158,12 @@ def export_fmu(
     elif kind == "me":
         raise InputError("a controller is sampled, not continuous: export it with --kind cs")
     else:
-        from bayesrace.controller.assembly import read_checked, read_settings
-        from bayesrace.controller.settings import MpcSettings
         from bayesrace.operation.host import drives_by
 
-        course, line, folder = _controller(parameters, track, raceline, artefact)
-        learned = None if weights is None else read_checked(weights, folder, parameters)
-        settings = read_settings(mpc, MpcSettings)
-        driven_by = drives_by(folder, parameters, course, line, learned, settings)
+        chosen = _controller(parameters, track, raceline, weights, mpc, artefact)
         fallback = FallbackSettings().model_dump() | {"brake_fade_mps": parameters.brake_fade_mps}
         definition = controller_fmu(
-            folder, parameters, **driven_by, fallback=fallback, version=number
+            chosen[0], parameters, **drives_by(*chosen), fallback=fallback, version=number
         )
     pack(definition, out, platform or None)
     typer.echo(f"{definition.name}, FMI {number}.0 {kind}: {out}")

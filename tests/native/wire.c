@@ -27,9 +27,10 @@ static size_t again(const uint8_t *data, size_t size, uint8_t *out) {
 
 int main(void) {
     static uint8_t data[BR_DATAGRAM], out[BR_DATAGRAM];
+    static const volatile sig_atomic_t stopping = 0;
     char why[64];
     br_link link;
-    if (br_link_open(&link, "stdio", why, sizeof why)) return 1;
+    if (br_link_open(&link, "stdio", &stopping, why, sizeof why)) return 1;
     for (long size; (size = link.by->receive(&link, data, sizeof data)) >= 0;)
         br_link_send(&link, out, again(data, (size_t)size, out));
     return link.unsent != 0;
