@@ -3,8 +3,8 @@
 The artefact folder holds the library, what its headers declare in the form that Python reads, the
 manifest, and everything it was made from (our C, CasADi's C, DAQP's headers and its static library
 for this platform or its C, MIT licence), so that it can be rebuilt or embedded without Python:
-``cc -O3 *.c libdaqpstat.a -I. -lm``, or ``cc -O3 *.c daqp/*.c -I. -lm``. Its folder ``host`` has C
-that loads racing line, weights and settings from files.
+``cc -O3 *.c libdaqpstat.a -I. -lm``, or ``cc -O3 *.c daqp/*.c -I. -lm``. Its folder ``host`` has
+the C of a program that hosts it: loop, messages, links, files of line, weights and settings.
 """
 
 import hashlib
@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Final
 from bayesrace.cache import code_folder, digest, kept, locked, note_use, software
 from bayesrace.codegen.compiler import FLAGS, Compiler, find_compiler
 from bayesrace.codegen.daqp import HOW_TO_GET, unpack_sources
+from bayesrace.codegen.messages import messages_header
 from bayesrace.codegen.platforms import Platform, host_platform
 from bayesrace.codegen.settings import BuildSettings
 from bayesrace.errors import InputError
@@ -44,9 +45,12 @@ if TYPE_CHECKING:
 __all__ = [
     "HOST",
     "NATIVE",
+    "PROGRAM",
+    "artefact_compiler",
     "build",
     "build_hash",
     "generate",
+    "host_program",
     "problem_of",
 ]
 
@@ -56,13 +60,17 @@ NATIVE: Final = Path(__file__).parents[1] / "controller" / "native"
 HOST: Final = "host"
 """Folder of the C that is for hosts, and no part of the library."""
 
+PROGRAM: Final = "bayesrace-controller"
+"""The controller without Python: :func:`host_program`."""
+
 _MODE: Final = 0o755
 """Of the files that are loaded: the umask may allow more, and files that others may write are
 refused."""
 
 _SHAPED_BY: Final = (
     "controller/native",
-    "controller/native/host",
+    "controller/host",
+    "messages",
     "codegen",
     "codegen/problems",
     "vehicles",
@@ -162,7 +170,8 @@ def _compile(
     generate(problem, settings, folder)
     for path in NATIVE.glob("*.[ch]"):
         shutil.copy(path, folder)
-    shutil.copytree(NATIVE / HOST, folder / HOST)
+    shutil.copytree(NATIVE.parent / HOST, folder / HOST)
+    (folder / HOST / "br_messages.h").write_text(messages_header())
     shutil.copytree(include / "daqp", folder / "daqp")
     # its licence wants to go where its code goes
     shutil.copy(include / "licenses" / "daqp-external" / "LICENSE", folder / "daqp")
@@ -196,29 +205,44 @@ def _write_declarations(compiler: Compiler, folder: Path) -> None:
 def _library(compiler: Compiler, folder: Path) -> bytes:
     """The library of the sources in a folder; compiled once for all cars that share them, such as
     those that differ in weights, margins or friction alone."""
-    archives, sources = list(folder.glob("*.a")), [*folder.glob("*.c"), *folder.glob("daqp/*.c")]
+    return _compiled("library", compiler.shared_library, compiler, folder)
+
+
+def host_program(artefact: Path, compiler: Compiler) -> bytes:
+    """The executable of ``controller/host`` with the artefact's controller linked in."""
+    return _compiled("host", compiler.program, compiler, artefact, artefact / HOST)
+
+
+def _compiled(
+    what: str, link: Callable[[list[Path], list[Path], list[Path], Path], None],
+    compiler: Compiler, folder: Path, *more: Path,
+) -> bytes:  # fmt: skip
+    """What ``link`` makes of the sources of an artefact's folder and of others; from the cache if
+    it is there."""
+    archives, folders = sorted(folder.glob("*.a")), [folder, *more]
+    sources = sorted(one for each in (*folders, folder / "daqp") for one in each.glob("*.c"))
     files = sorted((*folder.rglob("*.[ch]"), *archives))
     named = (part for file in files for part in (file.name, file.read_bytes()))
     identity = digest((*compiler.command, compiler.version, *FLAGS, *named))
 
     def make(path: Path) -> None:
-        compiler.shared_library(sorted(sources), [folder], archives, path)
+        link(sources, folders, archives, path)
         data = path.read_bytes()
         path.write_bytes(hashlib.sha256(data).digest() + data)
 
-    return kept(code_folder() / f"library-{identity}", make, _read_library)
+    return kept(code_folder() / f"{what}-{identity}", make, _read_sealed)
 
 
-def _read_library(path: Path) -> bytes:
-    """A library behind its SHA-256; InputError if it is absent, damaged or another user's."""
+def _read_sealed(path: Path) -> bytes:
+    """What is behind its SHA-256; InputError if it is absent, damaged or another user's."""
     try:
         data = trusted(path).read_bytes()
     except OSError as error:
         raise InputError(f"{path}: {error.strerror or error}") from None
-    seal, library = data[:32], data[32:]
-    if hashlib.sha256(library).digest() != seal:
+    seal, code = data[:32], data[32:]
+    if hashlib.sha256(code).digest() != seal:
         raise InputError(f"{path} is damaged")
-    return library
+    return code
 
 
 def build(
@@ -237,7 +261,7 @@ def build(
     Raises CompileError with the compiler's own words, InputError if there is no compiler.
     """
     cache = code_folder()
-    compiler = _compiler(platform, daqp)
+    compiler = artefact_compiler(platform, daqp)
     identity = build_hash(settings, compiler, problem, daqp)
     name = problem.name if problem else f"{settings.problem}-{settings.model}"
     target = cache / f"{name}-{identity}"
@@ -277,7 +301,7 @@ def build(
     return target, manifest
 
 
-def _compiler(platform: Platform | None, daqp: Path | None) -> Compiler:
+def artefact_compiler(platform: Platform | None, daqp: Path | None) -> Compiler:
     """What builds for a platform, this machine's own by default."""
     if platform is None or platform == host_platform():
         return find_compiler()

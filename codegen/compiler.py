@@ -67,27 +67,39 @@ class Compiler:
         flags: tuple[str, ...] = FLAGS,
         exports: str = "br_mpc_*; br_cycle_*; br_estimator_*",
     ) -> None:
-        """Compiles ``sources``, as many at once as there are processors, and links them with
-        ``archives``; hides all symbols but ``exports``, patterns with semicolons between."""
-        seen = [f"-I{path}" for path in includes]
-        with (
-            temporary_folder() as folder,
-            ThreadPoolExecutor(os.cpu_count() or 1) as pool,
-        ):
-            objects = [folder / f"{i}.o" for i in range(len(sources))]
-
-            def compile_one(source: Path, target: Path) -> None:
-                self.run(*flags, *seen, "-c", source, "-o", target)
-
-            list(pool.map(compile_one, sources, objects))  # after a failure no other is begun
-            line: list[str | Path] = [*flags, "-shared", *objects, *archives, "-lm", "-o", out]
+        """Compiles ``sources`` and links them with ``archives``; hides all symbols but ``exports``,
+        patterns with semicolons between."""
+        with temporary_folder() as folder:
+            line: list[str | Path] = ["-shared"]
             if platform.system() == "Linux":
                 # A version script instead of --exclude-libs, which zig's linker does not know;
                 # -z defs, or a library that lacks a symbol would fail only when it is loaded.
                 script = folder / "exports.map"
                 script.write_text(f"{{ global: {exports}; local: *; }};\n")
                 line += [f"-Wl,--version-script={script}", "-Wl,-z,defs"]
-            self.run(*line)
+            self._link(sources, includes, archives, out, flags, line, folder)
+
+    def program(
+        self, sources: list[Path], includes: list[Path], archives: list[Path], out: Path
+    ) -> None:
+        """Compiles ``sources`` and links them with ``archives``."""
+        with temporary_folder() as folder:
+            self._link(sources, includes, archives, out, FLAGS, [], folder)
+
+    def _link(
+        self, sources: list[Path], includes: list[Path], archives: list[Path], out: Path,
+        flags: tuple[str, ...], how: list[str | Path], folder: Path,
+    ) -> None:  # fmt: skip
+        """As many files at once as there are processors, in an empty folder."""
+        seen = [f"-I{path}" for path in includes]
+        objects = [folder / f"{i}.o" for i in range(len(sources))]
+
+        def compile_one(source: Path, target: Path) -> None:
+            self.run(*flags, *seen, "-c", source, "-o", target)
+
+        with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
+            list(pool.map(compile_one, sources, objects))  # after a failure no other is begun
+        self.run(*flags, *how, *objects, *archives, "-lm", "-o", out)
 
     def run(self, *arguments: str | Path, folder: Path | None = None) -> None:
         """Runs it in a folder, the current one by default; CompileError with what it printed."""

@@ -1,7 +1,7 @@
 """Racing line, weights and settings as files for controllers that run without Python.
 
-C programs (examples/c_host) and the controller's FMU load them by controller/native/host, where
-br_files.h describes the formats. Being data, they can be exchanged without compiling anything.
+The controller without Python and its FMU load them by controller/host/br_files.c; br_files.h
+describes the formats. Being data, they can be exchanged without compiling anything.
 """
 
 import struct
@@ -39,9 +39,10 @@ PATH_COLUMNS: Final = 7
 PATH_CAPACITY: Final = 8192
 """BR_PATH_CAPACITY there."""
 
-_SCHEMA: Final = 2
+_SCHEMA: Final = 3
 HEAD: Final = struct.Struct("<8sIIQQ")
 IDENTITY_BYTES: Final = 256
+_VERSION_BYTES: Final = 801
 
 
 def _fnv1a(data: bytes) -> int:
@@ -73,14 +74,15 @@ def weights_file(weights: Weights | None, identity: str, capacity: int) -> bytes
     ``identity``: of the discretised model that the controller predicts with, ``capacity``: training
     points that it has room for. InputError for weights of another model or with more.
     """
+    none = weights is None
     if weights is None:
         weights = zero_weights("none", identity)
     weights.check_fit(identity, capacity)
-    name = identity.encode()
-    if len(name) >= IDENTITY_BYTES:
-        raise InputError(f"the model's identity '{identity}' is too long for a weights file")
-    body = name.ljust(IDENTITY_BYTES, b"\0") + pack_weights(weights)
-    return _file(b"BRFMGPWT", body, capacity)
+    words = [(identity, IDENTITY_BYTES), ("" if none else weights.version, _VERSION_BYTES)]
+    if any(len(word.encode()) >= room for word, room in words):
+        raise InputError(f"identity or version of weights is too long for their file: {words}")
+    head = b"".join(word.encode().ljust(room, b"\0") for word, room in words)
+    return _file(b"BRFMGPWT", head + pack_weights(weights), capacity)
 
 
 def settings_file(values: Mapping[str, float | tuple[float, ...]]) -> str:

@@ -203,7 +203,6 @@ class ControllerProcess:
         inbox, timing = self.inbox, self._timing
         inbox.spin_s = LOCKSTEP_SPIN_S
         timing.wake_us = 0.0
-        timing.missed = False
         state: State | None = first
         while not self._service.stopping:
             if state is not None:
@@ -267,8 +266,6 @@ class ControllerProcess:
         decision = self._cycle.decide(decided_at_s, budget_s, spent_s, limits)
         timing.overruns += clock.monotonic_ns() > self._budget_end_ns
         self._send(state, decision)
-        timing.missed = clock.monotonic_ns() > schedule.deadline_ns
-        timing.misses += timing.missed
 
     def _serve_others(self) -> None:
         """What has happened meanwhile."""
@@ -385,6 +382,9 @@ class ControllerProcess:
         begin_ns = clock.perf_counter_ns()
         self._actuations.put(self._actuation(state, decision), lockstep=state.lockstep)
         timing.encode_us = (clock.perf_counter_ns() - begin_ns) * 1e-3
+        late = clock.monotonic_ns() > self._schedule.deadline_ns
+        timing.missed = late and not state.lockstep
+        timing.misses += timing.missed
         message = self._cycle.telemetry(self._telemetry.next_seq, state, decision, self._arrived_ns)
         self._telemetry.put(message, lockstep=state.lockstep)
 

@@ -21,7 +21,7 @@ ROOT: Final = Path(__file__).resolve().parents[1]
 OUT: Final = ROOT / "build" / "coverage" / "native"
 OURS: Final = {
     path.name
-    for folder in ("controller/native", "controller/native/host", "codegen/fmu/native")
+    for folder in ("controller/native", "controller/host", "codegen/fmu/native")
     for path in (ROOT / folder).glob("*.[ch]")
 }
 WITHOUT_CODE: Final = {"br_avx2.c", "br_avx512.c"}
@@ -29,7 +29,7 @@ WITHOUT_CODE: Final = {"br_avx2.c", "br_avx512.c"}
 
 TESTS: Final = (
     "native_", "blocks", "turn", "fmu_controller", "fmu_export", "fmu_misuse", "driver", "fallback",
-    "compensation", "c_host",
+    "compensation", "host",
 )  # fmt: skip
 """Beginnings of the names of the modules that test C."""
 

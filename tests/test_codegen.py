@@ -400,7 +400,7 @@ def test_what_is_built_may_be_loaded_whatever_the_umask(
 ) -> None:
     before = os.umask(umask)
     try:
-        export.build(cast("Any", lambda **_: SMALL), tmp_path / "new" / "copy", None, None)
+        export.build(cast("Any", lambda **_: SMALL), tmp_path / "new" / "copy", None, None, False)
     finally:
         os.umask(before)
     (folder,) = contents(cache)
@@ -412,7 +412,7 @@ def test_nothing_is_built_where_it_would_not_be_loaded(cache: Path, tmp_path: Pa
     (tmp_path / "open").mkdir()
     (tmp_path / "open").chmod(0o777)
     with pytest.raises(InputError, match=r"open is writable for other users.*chmod go-w"):
-        export.build(cast("Any", lambda **_: SMALL), tmp_path / "open" / "copy", None, None)
+        export.build(cast("Any", lambda **_: SMALL), tmp_path / "open" / "copy", None, None, False)
     assert not cache.exists()
     assert not [*tmp_path.rglob(LIBRARY)]
     cache.mkdir()

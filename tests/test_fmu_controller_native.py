@@ -102,11 +102,12 @@ def damaged(data: bytes, random: np.random.Generator) -> list[bytes]:
 def hostile(data: bytes, random: np.random.Generator) -> list[bytes]:
     """Counts, kernels, lengths and numbers with a checksum that fits; some are usable."""
     values = (0, 1, 3, 4, 1024, 1025, 2**31, 2**32 - 1, 0x7FF00000, 0x7FF80000)
-    places = (32, 36, 288, 292, 300)
+    outputs = 32 + 256 + 801  # where they begin in a file of weights
+    places = (32, 36, outputs, outputs + 4, outputs + 12)
     changes = [(len(data), at, value) for at in places for value in values]
     for _ in range(80):
         end = int(random.choice([len(data), *random.integers(40, len(data), 3)]))
-        at = int(random.choice([*range(288, 408, 4), *random.integers(32, end, 9)]))
+        at = int(random.choice([*range(outputs, outputs + 120, 4), *random.integers(32, end, 9)]))
         changes.append((end, min(at, end - 4), int(random.choice(values))))
     files = []
     for end, at, value in changes:

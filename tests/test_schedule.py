@@ -1,10 +1,16 @@
 """The loop keeps its rate, and its releases meet the states, without any clock being read."""
 
+import re
+from pathlib import Path
+
 import numpy as np
 import pytest
+from cffi import FFI
 from hypothesis import given
 from hypothesis import strategies as st
 
+from bayesrace.codegen.build import NATIVE
+from bayesrace.codegen.compiler import find_compiler
 from bayesrace.controller.schedule import Schedule
 
 MS = 1_000_000
@@ -128,3 +134,42 @@ def test_a_release_knows_which_states_are_missing(
     schedule.observe(100 * MS, 5.0, 0.0)
     ages = {age_ms: schedule.missing(5.0 - age_ms * 1e-3, interval_s) for age_ms in missing}
     assert ages == missing
+
+
+@pytest.mark.parametrize("rate_hz", [50.0, 500.0, 33.3])
+@pytest.mark.parametrize("interval_s", [0.02, 0.01, 0.021])
+def test_the_schedule_in_c_keeps_the_same_releases(
+    tmp_path: Path, rate_hz: float, interval_s: float
+) -> None:
+    """States that are late, lost, or after a jump of the clock; cycles that take too long."""
+    source = NATIVE.parent / "host" / "br_schedule.c"
+    out = tmp_path / "schedule.so"
+    find_compiler().run("-O2", "-fPIC", "-shared", source, "-lm", "-o", out)
+    ffi, header = FFI(), source.with_suffix(".h").read_text()
+    most = re.search(r"#define BR_WINDOW (\d+)", header)
+    assert most is not None
+    ffi.cdef(re.sub(r"^#.*$", "", header, flags=re.M).replace("BR_WINDOW", most[1]))
+    library, random = ffi.dlopen(str(out)), np.random.default_rng(7)
+    one, other = Schedule(rate_hz), ffi.new("br_schedule *")
+    other.period_ns = one.period_ns
+    begin_ns, ahead_ns = 10**15, 0
+    one.start(begin_ns)
+    library.br_schedule_start(other, begin_ns)
+    for k in range(3000):
+        ahead_ns += 7 * MS * int(random.random() < 0.002)
+        late_ns = int(random.exponential(5e4) * (100 if random.random() < 0.02 else 1))
+        arrival_ns = begin_ns + ahead_ns + late_ns + round(k * interval_s * 1e9)
+        if random.random() > 0.05:
+            known = k > 0
+            one.observe(arrival_ns, k * interval_s, interval_s * known)
+            library.br_schedule_observe(other, arrival_ns, k * interval_s, interval_s * known)
+        while one.release_ns < arrival_ns:
+            now_ns = arrival_ns + int(random.integers(0, 60 * MS) * (random.random() < 0.01))
+            assert library.br_schedule_advance(other, now_ns) == one.advance(now_ns)
+        assert other.release_ns == one.release_ns
+        time_s = (k - int(random.integers(0, 3))) * interval_s
+        missing = library.br_schedule_missing(other, time_s, interval_s)
+        assert missing == one.missing(time_s, interval_s)
+        assert library.br_schedule_window_end_ns(other) == one.window_end_ns
+        plant_s = library.br_schedule_plant_time_s(other, arrival_ns)
+        assert plant_s == pytest.approx(one.plant_time_s(arrival_ns), abs=1e-12)

@@ -1,11 +1,12 @@
 """Messages between processes.
 
 ``types`` has the message classes, ``table`` the topics and services, ``codec`` turns messages into
-bytes, and into JSON for logs, and refuses everything else, ``numbering`` counts losses. What their
-``__all__`` name is public.
+bytes, and into JSON for logs, and refuses everything else, ``datagram`` puts topic and message
+together for links without keys, ``numbering`` counts losses. What their ``__all__`` name is public.
 """
 
 from bayesrace.messages.codec import *  # noqa: F403
+from bayesrace.messages.datagram import *  # noqa: F403
 from bayesrace.messages.numbering import *  # noqa: F403
 from bayesrace.messages.table import *  # noqa: F403
 from bayesrace.messages.types import *  # noqa: F403

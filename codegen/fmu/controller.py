@@ -119,7 +119,8 @@ def controller_fmu(
 
 def _sources(artefact: Path, car: Car, *, nominal: bool) -> dict[str, bytes]:
     """Of the artefact all but its clock: without one there are no budgets; two runs are equal."""
-    own = {*artefact.glob("*.[ch]"), *(artefact / HOST).iterdir()} - {artefact / "br_clock.c"}
+    own = {*artefact.glob("*.[ch]"), *(artefact / HOST).glob("br_files.*")}
+    own.remove(artefact / "br_clock.c")
     files = {path.name: path for path in (NATIVE / "controller.c", *own, *artefact.glob("*.a"))}
     files |= {f"daqp/{path.name}": path for path in (artefact / "daqp").iterdir()}
     planned = " ".join(f"X({name})" for name, *_ in _PLANNED)

@@ -2,7 +2,7 @@
  *
  * Everything between a message and the step: which states count, stop and go, delay compensation,
  * the step itself, and the fallback that answers where there is no solution to send. A host carries
- * the messages and keeps the time; examples/c_host is one without Python, controller/ the one of
+ * the messages and keeps the time; controller/host is one without Python, controller/ the one of
  * the controller process.
  *
  *   br_cycle_observe(cycle, &state);                                      a state has arrived

@@ -231,11 +231,13 @@ static void foresee(br_cycle *cycle) {
     for (int j = 0; j < BR_NE; ++j) residual->variance[j] += mismatch.unexplained[j];
 }
 
+#define SHORTEST_S 5e-4 /* a period that is shorter is none: there would be no end of them */
+
 /* Over the periods whose states were lost, by the inputs that had been sent. */
 static void catch_up(br_cycle *cycle) {
     br_estimator *estimator = &cycle->estimator;
     const double newest_s = cycle->stream.newest.time_s, interval_s = cycle->counters.interval_s;
-    if (cycle->unknown || !estimator->count || !(interval_s > 0)) return;
+    if (cycle->unknown || !estimator->count || !(interval_s > SHORTEST_S)) return;
     double last_s = br_estimator_newest(estimator)->time_s;
     if (newest_s - last_s > BR_LONGEST_S) return;
     for (; newest_s - last_s > 1.5 * interval_s; last_s += interval_s) {

@@ -2,7 +2,7 @@
 
 import shutil
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import typer
 
@@ -14,6 +14,10 @@ from bayesrace.trusted_files import trusted
 
 if TYPE_CHECKING:
     from bayesrace.codegen.settings import BuildSettings
+    from bayesrace.controller.settings import MpcSettings
+    from bayesrace.gp.weights import Weights
+    from bayesrace.raceline import RaceLine
+    from bayesrace.tracks import Track
     from bayesrace.vehicles import Car
 
 __all__ = ["build", "export", "fmu"]
@@ -32,8 +36,10 @@ def build(
         "DAQP's source distribution, whose C is compiled in place of CasADi's library of it.",
         metavar="FILE",
     ),
+    host: bool = options.flag("--host", "Add the controller without Python: a program."),
 ) -> None:
     """Generate and compile a controller, or take it from the cache; prints its folder."""
+    from bayesrace.codegen.build import artefact_compiler
     from bayesrace.codegen.build import build as make
     from bayesrace.codegen.platforms import get_platform
     from bayesrace.integrators import PERFECT
@@ -41,6 +47,8 @@ def build(
     chosen = settings()
     if chosen.model == "dynamic":
         chosen = settings(discretisation=PERFECT)
+    if host and out is None:
+        raise InputError("--host: the program goes into the folder of --out; give one")
     if out is not None:
         trusted(out, make=True)  # now, as its loader would refuse it after the work
     target = None if platform is None else get_platform(platform)
@@ -48,6 +56,10 @@ def build(
     if out is not None:
         shutil.copytree(folder, out, dirs_exist_ok=True, copy_function=_replace)
         folder = out
+    if host:
+        from bayesrace.operation.host import write_program
+
+        write_program(folder, folder, artefact_compiler(target, daqp))
     typer.echo(f"{folder}")
 
 
@@ -68,19 +80,15 @@ def export(
     artefact: Path | None = options.ARTEFACT,
     car: str = options.CAR,
 ) -> None:
-    """Write racing line, weights and settings for a C program (examples/c_host)."""
-    from bayesrace.codegen.host_files import export as write
-    from bayesrace.controller.process_settings import ControllerSettings
+    """Write racing line, weights and settings for the controller without Python."""
     from bayesrace.manifest import read_manifest
+    from bayesrace.operation.host import export_for
     from bayesrace.vehicles import get_car
 
     parameters = get_car(car)
-    folder, given = _controller(parameters, track, raceline, weights, mpc, artefact)
-    manifest = read_manifest(folder)
-    manifest.check_car(parameters, folder)
-    values = given["settings"] | ControllerSettings().cycle_values(parameters)
-    values |= parameters.tuning.estimation(nominal=False)
-    write(out, manifest, given["rows"], given["spacing_m"], values, given["weights"])
+    given = _controller(parameters, track, raceline, weights, mpc, artefact)
+    read_manifest(given[0]).check_car(parameters, given[0])
+    export_for(out, *given)
     typer.echo(f"{track or parameters.race_track}, {parameters.name}: {out}")
 
 
@@ -91,27 +99,20 @@ def _controller(
     weights: Path | None,
     mpc: Path | None,
     artefact: Path | None,
-) -> tuple[Path, dict[str, Any]]:
-    """Artefact of a controller, and what it drives by: the line as a table, settings, weights."""
+) -> "tuple[Path, Car, Track, RaceLine, Weights | None, MpcSettings]":
+    """A controller's artefact and what it drives by."""
     from bayesrace.codegen.build import build as make
     from bayesrace.codegen.settings import BuildSettings
-    from bayesrace.controller.assembly import make_path_table, read_checked, read_settings
+    from bayesrace.controller.assembly import read_checked, read_settings
     from bayesrace.controller.settings import MpcSettings
-    from bayesrace.manifest import read_manifest
     from bayesrace.raceline import racing_line, read_raceline_for
     from bayesrace.tracks import load_track
 
     course = load_track(track or car.race_track, car.width_m)
     line = read_raceline_for(raceline, course, car) if raceline else racing_line(course, car)
-    table = make_path_table(course, line, car.tuning.path.spacing_m)
     folder = artefact or make(BuildSettings(car=car))[0]
-    problem = read_manifest(folder).problem.name
-    return folder, {
-        "rows": table.rows,
-        "spacing_m": table.spacing_m,
-        "settings": read_settings(mpc, MpcSettings).parameters(car, problem),
-        "weights": None if weights is None else read_checked(weights, folder, car),
-    }
+    learned = None if weights is None else read_checked(weights, folder, car)
+    return folder, car, course, line, learned, read_settings(mpc, MpcSettings)
 
 
 def export_fmu(
@@ -157,10 +158,12 @@ def export_fmu(
     elif kind == "me":
         raise InputError("a controller is sampled, not continuous: export it with --kind cs")
     else:
-        folder, drives_by = _controller(parameters, track, raceline, weights, mpc, artefact)
+        from bayesrace.operation.host import drives_by
+
+        chosen = _controller(parameters, track, raceline, weights, mpc, artefact)
         fallback = FallbackSettings().model_dump() | {"brake_fade_mps": parameters.brake_fade_mps}
         definition = controller_fmu(
-            folder, parameters, **drives_by, fallback=fallback, version=number
+            chosen[0], parameters, **drives_by(*chosen), fallback=fallback, version=number
         )
     pack(definition, out, platform or None)
     typer.echo(f"{definition.name}, FMI {number}.0 {kind}: {out}")

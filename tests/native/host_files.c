@@ -18,7 +18,7 @@ int main(int argc, char **argv) {
         memset(text, 0x55, sizeof text);
         br_mpc *mpc;
         if (br_mpc_init(block, size, &mpc)) return 2;
-        const int failed = br_files_load(mpc, argv[i], argv[1], text, sizeof text);
+        const int failed = br_files_load(mpc, argv[i], argv[1], NULL, text, sizeof text);
         if (failed && (!memchr(text, 0, sizeof text) || strlen(text) < 20)) return 1;
         printf("%d %s\n", failed, failed ? text : "");
     }

@@ -41,7 +41,7 @@ bool fmu_model_create(fmu_instance *instance) {
     if (!instance->resources)
         return fmu_refuse(instance, "controller: the importer names no resources folder, which "
                                     "holds the racing line and the weights");
-    if (br_files_load(c->mpc, instance->resources, BR_MODEL_IDENTITY, text, sizeof text))
+    if (br_files_load(c->mpc, instance->resources, BR_MODEL_IDENTITY, NULL, text, sizeof text))
         return fmu_refuse(instance, "controller: %s", text);
     return true;
 }

@@ -11,14 +11,13 @@ from dataclasses import dataclass
 from typing import Final
 
 from bayesrace.codegen.fmu import FmuDefinition, controller_fmu, pack
-from bayesrace.controller.assembly import make_path_table
 from bayesrace.controller.cycle import Cycle as Timed
 from bayesrace.controller.driver import Decision, Driver
 from bayesrace.files import temporary_folder
 from bayesrace.gp.weights import pack_weights
 from bayesrace.manifest import read_manifest
 from bayesrace.messages import QUANTITIES, Telemetry
-from bayesrace.studies.evidence.c_host import CHost
+from bayesrace.operation.host import HostProgram, drives_by
 from bayesrace.studies.evidence.replay.controller import Setup
 from bayesrace.studies.evidence.replay.recording import Cycle, Life
 
@@ -144,19 +143,22 @@ def _plain(run: Sequence[Cycle]) -> list[Cycle]:
 
 
 def _c_host(setup: Setup, run: Sequence[Cycle]) -> Iterator[Answer]:
-    """By the program of examples/c_host, compiled here."""
+    """By the program of controller/host, compiled here."""
     if not run:
         return
     weights = setup.weights(run[0].sent.weights_version)
     every = (state for cycle in run for state in cycle.states)
     with temporary_folder() as folder:
-        host = CHost.made(
+        host = HostProgram.made(
             folder, setup.artefact, setup.car, setup.track, setup.line, weights, setup.mpc
         )
-        found = host.answers(one for one in every if (one.epoch, one.run) == run[0].run)
+        answers = host.answers(one for one in every if (one.epoch, one.run) == run[0].run)
+    found = {sent.state_seq: (sent, how) for sent, how in answers}
     for cycle in run:
         if answer := found.get(cycle.sent.state_seq):
-            yield Answer(cycle, *answer)
+            sent, how = answer
+            u = sent.u[0], sent.u[1]
+            yield Answer(cycle, u, sent.status, how.fallback, how, sent.weights_version)
 
 
 def _fmu(setup: Setup, run: Sequence[Cycle]) -> Iterator[Answer]:
@@ -198,10 +200,7 @@ def _fmu(setup: Setup, run: Sequence[Cycle]) -> Iterator[Answer]:
 
 
 def _definition(setup: Setup, version: str) -> FmuDefinition:
-    car, problem = setup.car, read_manifest(setup.artefact).problem.name
-    table = make_path_table(setup.track, setup.line, car.tuning.path.spacing_m)
+    car, weights = setup.car, setup.weights(version)
+    given = drives_by(setup.artefact, car, setup.track, setup.line, weights, setup.mpc)
     fallback = setup.cycle.fallback.model_dump() | {"brake_fade_mps": car.brake_fade_mps}
-    return controller_fmu(
-        setup.artefact, car, rows=table.rows, spacing_m=table.spacing_m, fallback=fallback,
-        settings=setup.mpc.parameters(car, problem), weights=setup.weights(version), version=2,
-    )  # fmt: skip
+    return controller_fmu(setup.artefact, car, **given, fallback=fallback, version=2)

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bayesrace.messages import State
-from bayesrace.studies.evidence.c_host import C_HOST, CHost
+from bayesrace.operation.host import HostProgram
 
 __all__ = ["COUNTED", "Counts", "count_instructions", "missing"]
 
@@ -32,12 +32,10 @@ _PART: Final = re.compile(r"^desc: Trigger: --dump-after=(\w+)$.*^totals: (\d+)$
 
 def missing() -> str:
     """Why nothing can be counted here; empty if it can."""
-    if shutil.which("valgrind") is None:
-        return "valgrind is not installed"
-    return "" if C_HOST.is_file() else f"no {C_HOST}: its program is an example of the repository"
+    return "" if shutil.which("valgrind") else "valgrind is not installed"
 
 
-def count_instructions(host: CHost, states: Sequence[State]) -> Counts:
+def count_instructions(host: HostProgram, states: Sequence[State]) -> Counts:
     """Of the phases (n, 3) for each state that is answered."""
     counts = host.folder / "counts"
     tool = ["valgrind", "-q", "--tool=callgrind", f"--callgrind-out-file={counts}"]

@@ -24,6 +24,7 @@ from bayesrace.files import temporary_folder
 from bayesrace.gp.weights import Weights, read_weights
 from bayesrace.messages import State
 from bayesrace.operation.closed_loop import built_in_car
+from bayesrace.operation.host import HostProgram
 from bayesrace.operation.preparation import Prepared
 from bayesrace.operation.run_plan import RunPlan, run_request
 from bayesrace.operation.training_drives import PreparedTrack
@@ -31,7 +32,6 @@ from bayesrace.plant.car import CarRun, drive_lockstep
 from bayesrace.plant.simulator import PLANT
 from bayesrace.raceline import RaceLine
 from bayesrace.realtime import uncollected
-from bayesrace.studies.evidence.c_host import CHost
 from bayesrace.studies.evidence.timing.instructions import Counts, count_instructions
 from bayesrace.studies.evidence.timing.settings import TimingSettings
 from bayesrace.tracks import Track
@@ -170,7 +170,7 @@ class Rig:
     def _count(self, track: int, rough: bool = False) -> Counts:
         states = [structs.replace(one, lockstep=True) for one in self._states]
         with temporary_folder() as folder:
-            host = CHost.made(folder, *self._parts(track, rough), MpcSettings())
+            host = HostProgram.made(folder, *self._parts(track, rough), MpcSettings())
             return count_instructions(host, states)
 
     @property

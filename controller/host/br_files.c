@@ -9,13 +9,14 @@
 #include "br_files.h"
 
 #define HEAD_BYTES 32
-#define SCHEMA 2
+#define SCHEMA 3
 #define LINE_BYTES 512
 #define WHOLE_MAX 1000000
 #define GP_HEAD_BYTES (2 * 4 + (4 + BR_NZ) * 8)
 #define PATH_BYTES_MAX (8 + (size_t)BR_PATH_CAPACITY * BR_PATH_COLUMNS * 8)
-#define WEIGHTS_BYTES_MAX \
-    (BR_IDENTITY_BYTES + BR_NE * (GP_HEAD_BYTES + (size_t)BR_GP_CAPACITY * (BR_NZ + 1) * 8))
+#define WEIGHTS_BYTES_MAX                   \
+    (BR_IDENTITY_BYTES + BR_VERSION_BYTES + \
+     BR_NE * (GP_HEAD_BYTES + (size_t)BR_GP_CAPACITY * (BR_NZ + 1) * 8))
 
 /* A file being read, and what is left of it. */
 typedef struct {
@@ -131,13 +132,16 @@ static int load_output(reader *r, br_mpc_gp *gp, double *numbers) {
     return 0;
 }
 
-static int load_weights(reader *r, br_mpc *mpc, const char *identity) {
-    if (r->left < BR_IDENTITY_BYTES) return wrong(r, "is cut off", ANEW);
+static int load_weights(reader *r, br_mpc *mpc, const char *identity, char *version) {
+    if (r->left < BR_IDENTITY_BYTES + BR_VERSION_BYTES) return wrong(r, "is cut off", ANEW);
     if (strncmp((const char *)r->at, identity, BR_IDENTITY_BYTES))
         return wrong(r, "was learned for another model, car or time step",
                      "train with those of this controller");
-    r->at += BR_IDENTITY_BYTES;
-    r->left -= BR_IDENTITY_BYTES;
+    const char *named = (const char *)r->at + BR_IDENTITY_BYTES;
+    if (!memchr(named, 0, BR_VERSION_BYTES)) return wrong(r, "has a version without end", ANEW);
+    if (version) memcpy(version, named, BR_VERSION_BYTES);
+    r->at += BR_IDENTITY_BYTES + BR_VERSION_BYTES;
+    r->left -= BR_IDENTITY_BYTES + BR_VERSION_BYTES;
     const size_t each = BR_NZ + (size_t)BR_GP_CAPACITY * (BR_NZ + 1);
     double *numbers = malloc(BR_NE * each * sizeof *numbers);
     if (!numbers) return wrong(r, "does not fit into memory", "close other programs");
@@ -154,14 +158,15 @@ static int load_weights(reader *r, br_mpc *mpc, const char *identity) {
     return failed;
 }
 
-int br_files_load(br_mpc *mpc, const char *folder, const char *identity, char *text, size_t size) {
+int br_files_load(br_mpc *mpc, const char *folder, const char *identity,
+                  char version[BR_VERSION_BYTES], char *text, size_t size) {
     reader path = {.name = BR_FILE_PATH, .text = text, .text_size = size};
     reader weights = {.name = BR_FILE_WEIGHTS, .text = text, .text_size = size};
     int failed = open_file(&path, folder, "BRFMPATH", PATH_BYTES_MAX) || load_path(&path, mpc);
     free(path.data);
     if (failed) return -1;
     failed = open_file(&weights, folder, "BRFMGPWT", WEIGHTS_BYTES_MAX) ||
-             load_weights(&weights, mpc, identity);
+             load_weights(&weights, mpc, identity, version);
     free(weights.data);
     return failed ? -1 : 0;
 }

@@ -5,15 +5,16 @@
  * says:
  *
  *   0   magic, 8 bytes: "BRFMPATH" or "BRFMGPWT"
- *   8   schema, u32: 2
+ *   8   schema, u32: 3
  *   12  body's length in bytes, u32
  *   16  FNV-1a hash (64 bit) of the body, u64
  *   24  training points per output that the controller has room for, u64: for tools, not read here
  *
  * Body of path.bin: spacing [m] f64, then rows of BR_PATH_COLUMNS f64, see br_mpc_set_path.
- * Body of weights.bin: identity of the discretised model, 256 bytes, zero padded; for each of the
- * BR_NE outputs kernel u32, points n u32, offset, scale, signal, noise f64, BR_NZ length scales
- * f64, inputs n x BR_NZ f64, alpha n f64, see br_mpc_gp.
+ * Body of weights.bin: identity of the discretised model, 256 bytes, and version of the weights,
+ * 801 bytes, both zero padded; for each of the BR_NE outputs kernel u32, points n u32, offset,
+ * scale, signal, noise f64, BR_NZ length scales f64, inputs n x BR_NZ f64, alpha n f64, see
+ * br_mpc_gp.
  *
  * settings.txt: a line for each member of br_mpc_parameters, br_driving and br_estimation, its name
  * and its number, or its numbers, in the C locale; what comes after # is a comment. The limits of
@@ -34,10 +35,13 @@ extern "C" {
 #define BR_FILE_WEIGHTS "weights.bin"
 #define BR_FILE_SETTINGS "settings.txt"
 #define BR_IDENTITY_BYTES 256
+#define BR_VERSION_BYTES 801 /* 200 characters of UTF-8, and a 0 */
 
 /* Racing line and weights of the folder into mpc. 0, or -1 and a sentence in text. identity: of the
- * model that mpc predicts with (BR_MODEL_IDENTITY); weights for another one are refused. */
-int br_files_load(br_mpc *mpc, const char *folder, const char *identity, char *text, size_t size);
+ * model that mpc predicts with (BR_MODEL_IDENTITY); weights for another one are refused. version:
+ * where to put that of the weights, empty without any; NULL: nowhere. */
+int br_files_load(br_mpc *mpc, const char *folder, const char *identity,
+                  char version[BR_VERSION_BYTES], char *text, size_t size);
 
 /* The settings of the folder. 0, or -1 and a sentence in text. */
 int br_files_settings(const char *folder, br_mpc_parameters *parameters, br_driving *driving,

@@ -1,0 +1,55 @@
+"""Messages as datagrams, for links that have no keys: an array of a topic's name and the message.
+
+So speak the controller in C (controller/host/br_wire.h) and what is connected to it. In a stream
+each datagram follows its length (u32, big-endian).
+"""
+
+import struct
+from collections.abc import Iterator
+from typing import Any, Final
+
+import msgspec
+
+from bayesrace.errors import InputError
+from bayesrace.messages.codec import LARGEST_BYTES, decode, encode
+from bayesrace.messages.table import TOPICS, Topic
+from bayesrace.messages.types import Message
+
+__all__ = ["datagrams_in", "framed", "from_datagram", "to_datagram"]
+
+_PAIR: Final = b"\x92"
+_LENGTH: Final = struct.Struct(">I")
+_TOPICS: Final = {topic.name: topic for topic in TOPICS}
+_read: Final = msgspec.msgpack.Decoder(tuple[str, msgspec.Raw]).decode
+
+
+def to_datagram(topic: Topic[Any], message: Message) -> bytes:
+    """The datagram of a topic's message."""
+    return b"".join((_PAIR, msgspec.msgpack.encode(topic.name), encode(message)))
+
+
+def from_datagram(data: bytes) -> tuple[Topic[Any], Message]:
+    """Topic and message of a datagram; InputError for anything else."""
+    try:
+        name, payload = _read(data)
+        topic = _TOPICS[name]
+    except (ValueError, KeyError) as error:
+        raise InputError(f"no datagram of a topic: {error}") from None
+    return topic, decode(topic.message, bytes(payload))
+
+
+def framed(data: bytes) -> bytes:
+    """A datagram as part of a stream."""
+    return _LENGTH.pack(len(data)) + data
+
+
+def datagrams_in(stream: bytes) -> Iterator[bytes]:
+    """The datagrams of a whole stream; InputError if the last one is cut off."""
+    at = 0
+    while at < len(stream):
+        begin = at + _LENGTH.size
+        length = _LENGTH.unpack_from(stream, at)[0] if begin <= len(stream) else LARGEST_BYTES + 1
+        at = begin + length
+        if at > len(stream):
+            raise InputError("the stream of datagrams is cut off")
+        yield stream[begin:at]
