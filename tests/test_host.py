@@ -33,7 +33,7 @@ from bayesrace.codegen.settings import BuildSettings
 from bayesrace.controller import process
 from bayesrace.controller.assembly import PredictiveController
 from bayesrace.controller.driver import Level
-from bayesrace.controller.native_step import NativeStep
+from bayesrace.controller.native_step import NativeStep, Status
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import Weights
 from bayesrace.log import LogReader, LogWriter
@@ -41,10 +41,12 @@ from bayesrace.manifest import read_manifest
 from bayesrace.messages import (
     ACTUATION,
     BRAKING,
+    COMMAND,
     STATE,
     TELEMETRY,
     Actuation,
     BrakingPlan,
+    Command,
     Message,
     State,
     Topic,
@@ -269,6 +271,28 @@ def test_no_other_sender_ends_the_run_or_takes_its_answers(
     while received(one, ACTUATION).state_seq != 1:
         pass
     assert "from others 22," in ended(process)
+
+
+def test_a_stop_is_obeyed_whoever_sends_it_and_a_go(
+    plant: Plant, circuit: Circuit, tmp_path: Path
+) -> None:
+    one, process = plant
+    state = at_start(circuit, lockstep=True)
+    with socket.socket(one.family, socket.SOCK_DGRAM) as other:
+        other.connect(one.getpeername())
+        statuses = []
+        for k, said in enumerate(("", "stop", "", "go", "")):
+            if said:
+                command = Command(seq=k, source_time_ns=0, command=said, text="test")
+                other.send(to_datagram(COMMAND, command))
+                time.sleep(0.2)  # it has come before the next state
+            sent = replace(state, seq=k, time_s=0.02 * k, x=(*state.x[:3], 0.0, *state.x[4:]))
+            one.send(to_datagram(STATE, sent))
+            statuses.append((received(one, ACTUATION).status, received(one, TELEMETRY).fallback))
+    assert [level for _, level in statuses[1:3]] == [Level.STOP, Level.STOP]
+    assert statuses[1][0] == statuses[2][0] == Status.HALTED
+    assert statuses[0][0] == statuses[3][0] == 0
+    assert "commands 2," in ended(process)
 
 
 def test_another_plant_is_answered_once_the_first_is_silent(
