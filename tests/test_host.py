@@ -501,7 +501,7 @@ def test_no_sanitizer_finds_anything_whatever_the_states_say(
     for k in range(300):
         delays = (0.0, 0.0, 0.02) * int(random.integers(0, 64))
         sent = replace(
-            start, seq=k, time_s=0.02 * k, lockstep=bool(k // 100 % 2), actuation_delays=delays,
+            start, seq=k, time_s=0.02 * k, lockstep=k < 200, actuation_delays=delays,
             final=k % 90 == 89,
         )  # fmt: skip
         if k % 2:
@@ -518,5 +518,5 @@ def test_no_sanitizer_finds_anything_whatever_the_states_say(
         states.append(sent)
     answers = HostProgram(tmp_path).answers(states)
     assert program.name == PROGRAM
-    assert len(answers) > 50  # in real time not each state has one
+    assert len(answers) > 100
     assert np.isfinite([sent.u for sent, _ in answers]).all()
