@@ -4,6 +4,7 @@ The header goes with a controller's files (``host/br_messages.h``); ``controller
 says what its tables mean. A type that it has no form for is a programming error.
 """
 
+from dataclasses import dataclass, field
 from typing import Any, Final, cast
 
 from msgspec import Struct, inspect
@@ -11,18 +12,22 @@ from msgspec import Struct, inspect
 from bayesrace.messages import (
     ACTUATION,
     BRAKING,
+    COMMAND,
     QUANTITIES,
-    SENSOR_FAULTS,
     STATE,
     TELEMETRY,
     Reading,
+    Service,
     Topic,
+    message_of,
     schema_version,
 )
 
 __all__ = ["TOPICS_IN_C", "messages_header"]
 
-TOPICS_IN_C: Final[tuple[Topic[Any], ...]] = (STATE, ACTUATION, BRAKING, TELEMETRY)
+TOPICS_IN_C: Final[tuple[Topic[Any] | Service[Any, Any], ...]] = (
+    STATE, COMMAND, ACTUATION, BRAKING, TELEMETRY,
+)  # fmt: skip
 """What a controller in C receives and sends."""
 
 _HEAD: Final = """/* generated from bayesrace/messages: what a controller in C receives and sends */
@@ -39,16 +44,16 @@ _MOST_FIELDS: Final = 64
 
 def messages_header() -> str:
     """The text of br_messages.h."""
-    names, faults = (", ".join(f'"{one}"' for one in of) for of in (QUANTITIES, SENSOR_FAULTS))
-    low, high = _range(_plain(_fields(Reading)["values"].value_type.item_types[1])[0])
+    names = ", ".join(f'"{name}"' for name in QUANTITIES)
+    low, high = _range(_plain(_fields(Reading)["values"].value_type.item_types[1]))
     parts = [
         _HEAD,
-        f"#define BR_QUANTITY_NAMES {names}\n#define BR_SENSOR_FAULTS {faults}",
+        f"#define BR_QUANTITY_NAMES {names}",
         f"#define BR_DEVIATION_LOW {low}\n#define BR_DEVIATION_HIGH {high}\n",
         _structure(Reading, "reading", 0),
     ]
     parts += [
-        _structure(topic.message, topic.name, schema_version(topic.message))
+        _structure(message_of(topic), topic.name, schema_version(message_of(topic)))
         for topic in TOPICS_IN_C
     ]
     return "\n".join([*parts, "#endif\n"])
@@ -57,12 +62,12 @@ def messages_header() -> str:
 def _fields(kind: type[Struct]) -> dict[str, Any]:
     """Types of the fields by name, without their limits."""
     described = cast(inspect.StructType, inspect.type_info(kind))
-    return {one.encode_name: _plain(one.type)[0] for one in described.fields}
+    return {one.encode_name: _plain(one.type) for one in described.fields}
 
 
-def _plain(of: Any) -> tuple[Any, Any]:
-    """A type without, and with, what is noted beside it."""
-    return (of.type, of) if isinstance(of, inspect.Metadata) else (of, of)
+def _plain(of: Any) -> Any:
+    """A type without what is noted beside it."""
+    return of.type if isinstance(of, inspect.Metadata) else of
 
 
 def _range(number: Any) -> tuple[str, str]:
@@ -72,66 +77,76 @@ def _range(number: Any) -> tuple[str, str]:
 
 
 def _structure(kind: type[Struct], name: str, schema: int) -> str:
-    """A structure br_NAME and its table BR_NAME."""
-    structure = f"br_{name}_message"
-    members, rows = [], []
-    if len(_fields(kind)) > _MOST_FIELDS:
+    """A structure br_NAME_message and its table BR_NAME_TABLE; the words of its field FIELD, which
+    is one of them, are br_NAME_FIELD."""
+    fields = {field: _field(field, of) for field, of in _fields(kind).items()}
+    if len(fields) > _MOST_FIELDS:
         raise ValueError(f"{name} has more than {_MOST_FIELDS} fields")
-    for field, of in _fields(kind).items():
-        declared, row = _field(field, of, structure)
-        members += declared
-        rows.append(row)
-    table = f"br_{name}_fields"
+    structure, table = f"br_{name}_message", f"br_{name}_fields"
+    members = [f"    {member};" for one in fields.values() for member in one.members]
+    rows = [f"    {one.row(field, name)}," for field, one in fields.items()]
     return "\n".join(
         [
-            "typedef struct {",
-            *(f"    {one};" for one in members),
-            f"}} {structure};\n",
-            f"static const br_wire_field {table}[] = {{",
-            *(f"    {row}," for row in rows),
-            "};",
+            "typedef struct {", *members, f"}} {structure};\n",
+            *(_words_in_c(f"br_{name}_{field}", one.words) for field, one in fields.items()),
+            f"static const br_wire_field {table}[] = {{", *rows, "};",
             f"static const br_wire_table BR_{name.upper()}_TABLE __attribute__((unused)) = {{",
             f'    "{name}", {schema}, {len(rows)}, {table}, sizeof({structure})}};\n',
         ]
-    )
+    )  # fmt: skip
+
+
+def _words_in_c(name: str, words: list[str]) -> str:
+    listed = "".join(f'"{word}", ' for word in words)
+    return f"static const char *const {name}[] = {{{listed}NULL}};\n" if words else ""
+
+
+@dataclass(frozen=True)
+class _Field:
+    """``members`` of the structure, and what its row of the table says (br_wire.h)."""
+
+    members: list[str]
+    kind: str
+    least: int = 1
+    most: int = 1
+    number: Any = None
+    words: list[str] = field(default_factory=list)
+
+    def row(self, name: str, message: str) -> str:
+        """The row of the field of this name."""
+        structure = f"br_{message}_message"
+        low, high = ("0", "0") if self.number is None else _range(self.number)
+        counted = f"offsetof({structure}, {name}_count)" if len(self.members) > 1 else "BR_FIXED"
+        records = "&BR_READING_TABLE" if self.kind == "RECORDS" else "NULL"
+        words = f"br_{message}_{name}" if self.words else "NULL"
+        at = f"offsetof({structure}, {name})"
+        limits = f"{self.least}, {self.most}, {low}, {high}"
+        return f'{{"{name}", BR_{self.kind}, {at}, {counted}, {limits}, {records}, {words}}}'
 
 
 _NUMBERS: Final = {inspect.IntType: ("int64_t", "WHOLE"), inspect.FloatType: ("double", "REAL")}
 
 
-def _field(name: str, of: Any, structure: str) -> tuple[list[str], str]:
-    """Its members of the structure, and its row of the table."""
-    at, fixed = f"offsetof({structure}, {name})", "BR_FIXED"
-
-    def row(kind: str, least: int, most: int, number: Any = None, counted: str = fixed) -> str:
-        low, high = ("0", "0") if number is None else _range(number)
-        records = "&BR_READING_TABLE" if kind == "RECORDS" else "NULL"
-        return (
-            f'{{"{name}", BR_{kind}, {at}, {counted}, {least}, {most}, {low}, {high}, {records}}}'
-        )
-
+def _field(name: str, of: Any) -> _Field:
     if isinstance(of, inspect.BoolType):
-        return [f"int {name}"], row("FLAG", 1, 1)
+        return _Field([f"int {name}"], "FLAG")
     if isinstance(of, inspect.StrType):
-        most = of.max_length or max(len(word) for word in _words(of.pattern or ""))
-        return [f"char {name}[{4 * most + 1}]"], row("TEXT", 0, most)
+        words = _words(of.pattern) if of.pattern else []
+        most = of.max_length or max(map(len, words))
+        return _Field([f"char {name}[{4 * most + 1}]"], "TEXT", 0, most, words=words)
     if isinstance(of, inspect.DictType):
         pair = cast(inspect.TupleType, of.value_type)
-        value = _plain(pair.item_types[0])[0]
-        return [f"br_measures {name}"], row("MEASURES", 1, len(QUANTITIES), value)
+        value = _plain(pair.item_types[0])
+        return _Field([f"br_measures {name}"], "MEASURES", 1, len(QUANTITIES), value)
     if type(of) in _NUMBERS:
         declared, kind = _NUMBERS[type(of)]
-        return [f"{declared} {name}"], row(kind, 1, 1, of)
-    item = _plain(of.item_type)[0]
-    least, most = of.min_length or 0, of.max_length
+        return _Field([f"{declared} {name}"], kind, number=of)
+    item, least, most = _plain(of.item_type), of.min_length or 0, of.max_length
     counts = [] if least == most else [f"int {name}_count"]
-    counted = f"offsetof({structure}, {name}_count)" if counts else fixed
     if isinstance(item, inspect.StructType):
-        members = [*counts, f"br_reading_message {name}[{most}]"]
-        return members, row("RECORDS", least, most, counted=counted)
+        return _Field([*counts, f"br_reading_message {name}[{most}]"], "RECORDS", least, most)
     declared, kind = _NUMBERS[type(item)]
-    members = [*counts, f"{declared} {name}[{most}]"]
-    return members, row(f"{kind}S", least, most, item, counted)
+    return _Field([*counts, f"{declared} {name}[{most}]"], f"{kind}S", least, most, item)
 
 
 def _words(pattern: str) -> list[str]:

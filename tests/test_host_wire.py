@@ -22,11 +22,12 @@ from bayesrace.messages import (
     STATE,
     TELEMETRY,
     TRUTH,
+    WEIGHTS,
     Actuation,
     BrakingPlan,
+    Command,
     Message,
     Telemetry,
-    Topic,
     Truth,
     datagrams_in,
     framed,
@@ -57,7 +58,7 @@ def again(kinematic_artefact: Path, tmp_path_factory: pytest.TempPathFactory) ->
     return run
 
 
-def samples() -> list[tuple[Topic[Any], Message]]:
+def samples() -> list[tuple[Any, Message]]:
     """Usual and extreme ones of all that C knows."""
     instruments = (
         reading("pose", -1.0, x=1.0, y=-2.5, psi=900.0, deviation=(1e-12, 1e6, 0.01)),
@@ -74,6 +75,7 @@ def samples() -> list[tuple[Topic[Any], Message]]:
         (STATE, replace(state, estimated=True, readings=instruments[:1] * 16)),
         (ACTUATION, actuation),
         (ACTUATION, replace(actuation, weights_version="ü" * 100, u=(-1e3, 5e-324))),
+        (COMMAND, Command(seq=1, source_time_ns=2, command="stop", text="a cone on the track")),
         (BRAKING, blank(BrakingPlan, step_s=0.02, d=(0.5, -0.1), delta=(0.0, 0.35))),
         (TELEMETRY, whole),
         (
@@ -183,10 +185,11 @@ def test_of_states_both_want_every_field_once_and_no_other(again: Again) -> None
         to_datagram(TRUTH, blank(Truth, x=(0.0,) * 7, u_applied=(0.0, 0.0))),
         to_datagram(STATE, messages.state()) + b"\0",
         msgspec.msgpack.encode([COMMAND.name, {}]),
+        msgspec.msgpack.encode([WEIGHTS.name, {}]),
         msgspec.msgpack.encode(["x" * 31, {}]),
         msgspec.msgpack.encode(["x" * 32, {}]),
     ],
-    ids=range(14),
+    ids=range(15),
 )
 def test_what_is_no_message_of_its_topics_is_refused(again: Again, data: bytes) -> None:
     assert again([data, to_datagram(STATE, messages.state())])[0] == b""

@@ -12,30 +12,41 @@ import msgspec
 
 from bayesrace.errors import InputError
 from bayesrace.messages.codec import LARGEST_BYTES, decode, encode
-from bayesrace.messages.table import TOPICS, Topic
+from bayesrace.messages.table import SERVICES, TOPICS, Service, Topic
 from bayesrace.messages.types import Message
 
-__all__ = ["datagrams_in", "framed", "from_datagram", "to_datagram"]
+__all__ = ["datagrams_in", "framed", "from_datagram", "message_of", "to_datagram"]
+
+Named = Topic[Any] | Service[Any, Any]
 
 _PAIR: Final = b"\x92"
 _LENGTH: Final = struct.Struct(">I")
-_TOPICS: Final = {topic.name: topic for topic in TOPICS}
+_ROWS: Final[tuple[Named, ...]] = (*SERVICES, *TOPICS)
+_NAMED: Final = {one.name: one for one in _ROWS}
 _read: Final = msgspec.msgpack.Decoder(tuple[str, msgspec.Raw]).decode
 
 
-def to_datagram(topic: Topic[Any], message: Message) -> bytes:
-    """The datagram of a topic's message."""
+def message_of(named: Named) -> type[Message]:
+    """The class of a topic's messages, or of a service's requests."""
+    kind = named.message if isinstance(named, Topic) else named.request
+    if kind is None:
+        raise InputError(f"'{named.name}' is a file, no message")
+    return kind
+
+
+def to_datagram(topic: Named, message: Message) -> bytes:
+    """The datagram of a topic's message, or of a service's request."""
     return b"".join((_PAIR, msgspec.msgpack.encode(topic.name), encode(message)))
 
 
-def from_datagram(data: bytes) -> tuple[Topic[Any], Message]:
-    """Topic and message of a datagram; InputError for anything else."""
+def from_datagram(data: bytes) -> tuple[Named, Message]:
+    """Topic or service, and message, of a datagram; InputError for anything else."""
     try:
         name, payload = _read(data)
-        topic = _TOPICS[name]
+        topic = _NAMED[name]
     except (ValueError, KeyError) as error:
         raise InputError(f"no datagram of a topic: {error}") from None
-    return topic, decode(topic.message, bytes(payload))
+    return topic, decode(message_of(topic), bytes(payload))
 
 
 def framed(data: bytes) -> bytes:

@@ -156,14 +156,30 @@ static int from_other(const br_host *host) {
     return !br_same_address(&host->link.from, &host->link.peer);
 }
 
-static int read_state(br_host *host, size_t size) {
+/* Whether the datagram at hand is a message of that topic. */
+static int reads(const br_host *host, size_t size, const br_wire_table *table, void *message) {
     char topic[32];
     size_t payload;
     const uint8_t *data = host->datagram;
     const char *of = br_wire_topic(data, size, &payload, topic);
-    if (!of || strcmp(of, BR_STATE_TABLE.topic)) return -1;
-    if (br_wire_read(&BR_STATE_TABLE, data + payload, size - payload, &host->incoming)) return -1;
-    return host->incoming.actuation_delays_count % 3 ? -1 : 0; /* whole rows */
+    if (!of || strcmp(of, table->topic)) return 0;
+    return !br_wire_read(table, data + payload, size - payload, message);
+}
+
+static int reads_state(br_host *host, size_t size) {
+    return reads(host, size, &BR_STATE_TABLE, &host->incoming) &&
+           host->incoming.actuation_delays_count % 3 == 0; /* whole rows */
+}
+
+/* Stop and go, whoever says it. */
+static int obeys(br_host *host, size_t size) {
+    if (!reads(host, size, &BR_COMMAND_TABLE, &host->command)) return 0;
+    if (!strcmp(host->command.command, "stop"))
+        br_cycle_stop(host->cycle);
+    else
+        br_cycle_go(host->cycle);
+    host->timing.commands += 1;
+    return 1;
 }
 
 /* The next datagram, waited for until then. The end of the link ends the loop. */
@@ -172,11 +188,12 @@ static arrival receive_state(br_host *host, int64_t until_ns) {
     host->stopping |= size == BR_LINK_ENDED;
     if (size < 0) return NOTHING;
     const int64_t arrived_ns = br_now_ns();
+    if (obeys(host, (size_t)size)) return NO_NEW_STATE;
     if (from_other(host)) {
         host->timing.from_others += 1;
         return NO_NEW_STATE;
     }
-    if (read_state(host, (size_t)size)) {
+    if (!reads_state(host, (size_t)size)) {
         host->timing.refused += 1;
         return NO_NEW_STATE;
     }
@@ -343,7 +360,7 @@ static void prepare_next(br_host *host) {
 /* Uses what the cycle will use, without effect: message, cycle, message. */
 static void rehearse(br_host *host) {
     const size_t size = br_wire_write(&BR_STATE_TABLE, &host->state, host->datagram, BR_DATAGRAM);
-    read_state(host, size);
+    reads_state(host, size);
     br_cycle_rehearse(host->cycle);
     br_wire_write(&BR_ACTUATION_TABLE, &host->actuation, host->datagram, BR_DATAGRAM);
 }

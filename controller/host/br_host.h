@@ -29,7 +29,7 @@ typedef struct {
     int64_t released_ns, arrived_ns;
     double wake_us, decode_us, prepare_us, solve_us, encode_us, prepared_s;
     int missed, prepared_refusals, prepared_refused[BR_REFUSALS];
-    int64_t ticks, skipped, misses, overruns, late_states, taken, reported;
+    int64_t commands, ticks, skipped, misses, overruns, late_states, taken, reported;
     int64_t refused, from_others, readings_left_out; /* datagrams that are no state; those from
                                                       * others than the plant that is driven for;
                                                       * readings of too many instruments */
@@ -52,6 +52,7 @@ typedef struct {
     br_address unanswered_from;
     int has_state, has_unanswered;
     int64_t actuations, reports, brakings, braked_ns; /* sent so far; when the last plan was */
+    br_command_message command;
     br_measured measured;
     br_decision decision;
     br_braking plan;

@@ -130,7 +130,6 @@ static void report_timing(br_host *host, br_telemetry_message *m) {
 }
 
 void br_send_telemetry(br_host *host) {
-    static const char *const faults[] = {BR_SENSOR_FAULTS};
     const br_decision *decision = &host->decision;
     br_telemetry_message *m = &host->report;
     int refused[BR_REFUSALS];
@@ -143,7 +142,7 @@ void br_send_telemetry(br_host *host) {
     m->fallback = decision->level;
     m->delay_s = decision->delay_s;
     m->late_s = fmax(decision->late_s, 0);
-    strcpy(m->sensor_fault, faults[decision->fault]);
+    strcpy(m->sensor_fault, br_telemetry_sensor_fault[decision->fault]);
     report_step(host, m);
     report_estimate(host, m);
     m->refused_count = decision->stepped ? br_cycle_get_refusals(host->cycle, refused) : 0;

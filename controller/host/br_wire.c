@@ -173,7 +173,12 @@ int br_wire_characters(const char *text, size_t bytes) {
 
 static int fits(const br_wire_field *field, const char *text, size_t bytes) {
     const int count = bytes <= 4 * (size_t)field->most ? br_wire_characters(text, bytes) : -1;
-    return count >= field->least && count <= field->most;
+    if (count < field->least || count > field->most) return 0;
+    for (const char *const *word = field->words; word; ++word) {
+        if (!*word) return 0;
+        if (strlen(*word) == bytes && !memcmp(*word, text, bytes)) return 1;
+    }
+    return 1;
 }
 
 static int take_text(reader *r, const br_wire_field *field, char *text) {

@@ -30,7 +30,8 @@ typedef struct {
     size_t count_at; /* of how many there are, an int; BR_FIXED: always most */
     int least, most;
     double low, high;
-    const br_wire_table *of; /* of BR_RECORDS */
+    const br_wire_table *of;  /* of BR_RECORDS */
+    const char *const *words; /* of BR_TEXT, where it is one of these; the last is NULL */
 } br_wire_field;
 
 #define BR_FIXED ((size_t)-1)

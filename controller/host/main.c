@@ -123,6 +123,7 @@ static void report(void) {
         {"of other runs", count->foreign},
         {"datagrams refused", timing->refused},
         {"from others", timing->from_others},
+        {"commands", timing->commands},
         {"readings left out", timing->readings_left_out},
         {"cycles", timing->ticks},
         {"solution", count->levels[BR_SOLUTION]},

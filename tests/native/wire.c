@@ -7,18 +7,20 @@
 
 static union {
     br_state_message state;
+    br_command_message command;
     br_actuation_message actuation;
     br_braking_message braking;
     br_telemetry_message telemetry;
 } message;
 
 static size_t again(const uint8_t *data, size_t size, uint8_t *out) {
-    static const br_wire_table *const tables[] = {&BR_STATE_TABLE, &BR_ACTUATION_TABLE,
-                                                  &BR_BRAKING_TABLE, &BR_TELEMETRY_TABLE};
+    static const br_wire_table *const tables[] = {&BR_STATE_TABLE, &BR_COMMAND_TABLE,
+                                                  &BR_ACTUATION_TABLE, &BR_BRAKING_TABLE,
+                                                  &BR_TELEMETRY_TABLE};
     char topic[32];
     size_t payload;
     if (!br_wire_topic(data, size, &payload, topic)) return 0;
-    for (int i = 0; i < 4; ++i)
+    for (int i = 0; i < 5; ++i)
         if (!strcmp(tables[i]->topic, topic) &&
             !br_wire_read(tables[i], data + payload, size - payload, &message))
             return br_wire_write(tables[i], &message, out, BR_DATAGRAM);
