@@ -4,7 +4,8 @@
 
 A simulated car sends its states at a fixed rate by the monotonic clock, over UDP and over a Unix
 socket of this machine, to ``controller/host`` and to a program that sends each datagram back. The
-times are from before the system call that sends a state to after the one that receives its answer.
+times are from before the system call that sends a state to after the one that receives its answer,
+which acts from the next millisecond on.
 """
 
 import os
@@ -29,6 +30,9 @@ from bayesrace.messages import STATE, Actuation, State, from_datagram, to_datagr
 from bayesrace.operation.host import HostProgram
 from bayesrace.operation.settings import PreparationSettings
 from benchmarks.harness import Row, arguments, percentiles, prepared, report, resident_bytes
+
+STEP_S = 0.001
+"""Of the simulated car."""
 
 ECHO = """
 #include <netinet/in.h>
@@ -71,40 +75,45 @@ def started(line: list[str], link: str, folder: Path) -> Iterator[tuple[socket.s
 
 def driven(link: socket.socket, simulator: br.Simulator, rate_hz: float, seconds: float) -> Any:
     """Times from states to their answers [us]; an answer that is missing counts as a period."""
-    period_s, u = 1 / rate_hz, np.zeros(2)
+    period_s, u, after, applied = 1 / rate_hz, np.zeros(2), np.zeros(2), np.zeros(2)
     delays: tuple[float, ...] = ()
     count, begin_s = round(seconds * rate_hz), time.monotonic() + 0.1
+    steps = round(period_s / STEP_S)
     simulator.reset()
     times = np.full(count, 1e6 * period_s)
     for k in range(count):
         state = State(
             seq=k, source_time_ns=clock.monotonic_ns(), epoch=1, run=1, time_s=k * period_s,
-            x=tuple(simulator.state), u_applied=tuple(simulator.u_applied), lap=0,
+            x=tuple(simulator.state), u_applied=tuple(applied), lap=0,
             estimated=False, readings=(), lockstep=False, actuation_delays=delays, final=False,
         )  # fmt: skip
-        data, delays = to_datagram(STATE, state), ()
+        data, delays, acts = to_datagram(STATE, state), (), steps
         due_s = begin_s + k * period_s
         clock.sleep_until_ns(round(due_s * 1e9))
         sent_ns = clock.monotonic_ns()
         link.send(data)
-        while (left_s := due_s + 0.7 * period_s - time.monotonic()) > 0:
+        while (left_s := due_s + 0.5 * period_s - time.monotonic()) > 0:
             link.settimeout(left_s)
             try:
                 answer = link.recv(1 << 16)
             except TimeoutError:
                 break
             came_ns = clock.monotonic_ns()
-            if answer == data:  # a bare message
+            bare = answer == data
+            found = None if bare else from_datagram(answer)[1]
+            if bare or (isinstance(found, Actuation) and found.state_seq == k):
                 times[k] = (came_ns - sent_ns) * 1e-3
-                break
-            _, found = from_datagram(answer)
             if isinstance(found, Actuation) and found.state_seq == k:
-                times[k] = (came_ns - sent_ns) * 1e-3
-                u = np.array(found.u)
-                acts_s = (k + 1) * period_s - found.decided_at_s
+                after, acts = np.array(found.u), int(times[k] * 1e-6 / STEP_S) + 1
+                acts_s = k * period_s + acts * STEP_S - found.decided_at_s
                 delays = (float(k), times[k] * 1e-6, acts_s)
+            if times[k] < 1e6 * period_s:
                 break
-        simulator.step(u)
+        applied = np.zeros(2)
+        for step in range(steps):
+            simulator.step(after if step >= acts else u)
+            applied += np.array(simulator.u_applied) / steps
+        u = after
     return times[round(rate_hz) :]  # the first second warms up
 
 
@@ -118,8 +127,8 @@ def measured(what: str, line: list[str], link: str, folder: Path, simulator: br.
         memory = resident_bytes(pid) / 1e6
     return {
         "what": f"{what}, {rate_hz:g} Hz",
-        **{f"{name} [us]": value for name, value in percentiles(times, 50, 90, 99).items()},
-        "unanswered": int(np.sum(times >= 1e6 / rate_hz)), "memory [MB]": memory, "CPU [s]": cpu_s,
+        **{f"{name}_us": value for name, value in percentiles(times, 50, 90, 99).items()},
+        "unanswered": int(np.sum(times >= 1e6 / rate_hz)), "memory_mb": memory, "cpu_s": cpu_s,
     }  # fmt: skip
 
 
@@ -135,7 +144,7 @@ def main() -> None:
         source.write_text(ECHO)
         find_compiler().run("-O2", source, "-o", folder / "echo")
         for number, rate in enumerate(given.rates):
-            simulator = br.Simulator(car, on.track, step_s=1 / float(rate))
+            simulator = br.Simulator(car, on.track, step_s=STEP_S)
             udp, unix = f"udp:127.0.0.1:{7460 + number}", f"unix:{folder}/host"
             host = [str(folder / PROGRAM), str(folder)]
             ways = {
