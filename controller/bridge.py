@@ -36,8 +36,8 @@ __all__ = ["Bridge", "main"]
 
 _log = logging.getLogger("bayesrace.bridge")
 
-_DESERTED_NS: Final = 1_000_000_000
-"""Without an answer for so long, while states come, the controller is gone."""
+_DESERTED_S: Final = 1.0
+"""Without an answer for so long the controller is gone."""
 
 _ANSWERS: Final = (ACTUATION, BRAKING, TELEMETRY)
 
@@ -102,7 +102,7 @@ class Bridge:
             self._service.report_fault()
             self._service.check_hold()
             self.driver.repeat()
-            if self._deserted:
+            if self.driver.unanswered_s > _DESERTED_S:  # the car must not seem to be controlled
                 self._service.stopping = True
                 raise RestartError(f"the controller at {self._link.name} does not answer any more")
             if self._silent and (session := self._service.renew(renewed)) is not None:
@@ -113,20 +113,13 @@ class Bridge:
         self._answers.join()
 
     @property
-    def _deserted(self) -> bool:
-        """Whether states get no answers any more: the car must not seem to have a controller."""
-        newest, now_ns = self.driver.newest, clock.monotonic_ns()
-        driven = newest is not None and not newest.final and not self._silent
-        return driven and 0 < self.driver.answered_ns < now_ns - _DESERTED_NS
-
-    @property
     def _silent(self) -> bool:
         arrived_ns = self._service.arrived_ns
         return arrived_ns is None or clock.monotonic_ns() - arrived_ns > 1e9
 
     def _counters(self) -> dict[str, Scalar]:
         return {
-            "ticks": sum(self.driver.levels),
+            "ticks": self.driver.ticks,
             "states_received": self._states.accepted,
             "refused": self._states.refused + self._refused,
             "unsent": self._link.unsent,

@@ -101,21 +101,22 @@ class RemoteDriver:
         self._report: Telemetry | None = None
         self._levels: Counter[int] = Counter()
         self._counts: Counter[str] = Counter()
-        self.answered_ns = 0
-        """Monotonic clock at the newest answer."""
+        self._asked_ns = 0
+        """Monotonic clock at the first state since the newest answer; 0: none has come."""
         self._wanted, self._said, self._said_ns = "", 0, 0
 
     def forward(self, state: State, payload: bytes) -> None:
         """A state, as it has come."""
         self.newest = state  # before its answer can come
+        if not self._asked_ns and not state.final:
+            self._asked_ns = clock.monotonic_ns()
         self._link.send(_STATE + payload)
 
     def note(self, data: bytes) -> Message | None:
         """What a datagram of the controller says; None: nothing that is known."""
         _, message = from_datagram(data)
-        self.answered_ns = clock.monotonic_ns()
         if isinstance(message, Actuation):
-            self._answer = message
+            self._answer, self._asked_ns = message, 0
             self.controller.weights_version = message.weights_version
         elif isinstance(message, Telemetry):
             self._report, self.delay_s = message, message.delay_s
@@ -134,6 +135,19 @@ class RemoteDriver:
         if self._answer.status == Status.HALTED:
             return Phase.STOPPED
         return Phase.DRIVING if self._report.fallback == Level.SOLUTION else Phase.FALLBACK
+
+    @property
+    def unanswered_s(self) -> float:
+        """For how long a state has had no answer; 0 before the first answer of all: the controller
+        may start later."""
+        asked_ns = self._asked_ns
+        waits = asked_ns and self._answer is not None
+        return (clock.monotonic_ns() - asked_ns) * 1e-9 if waits else 0.0
+
+    @property
+    def ticks(self) -> int:
+        """Cycles so far: the ``seq`` of the next telemetry."""
+        return 0 if self._report is None else self._report.seq + 1
 
     @property
     def levels(self) -> list[int]:

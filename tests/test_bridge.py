@@ -13,18 +13,34 @@ import pytest
 
 from bayesrace.codegen.build import PROGRAM
 from bayesrace.controller.assembly import compiled_controller
-from bayesrace.controller.remote import RemoteLink
+from bayesrace.controller.driver import Phase
+from bayesrace.controller.native_step import Status
+from bayesrace.controller.remote import RemoteDriver, RemoteLink
 from bayesrace.controller.settings import MpcSettings
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import Weights
 from bayesrace.log import LogReader, LogWriter
-from bayesrace.messages import ACTUATION, EVENT, TELEMETRY, TRUTH
+from bayesrace.messages import (
+    ACTUATION,
+    COMMAND,
+    EVENT,
+    STATE,
+    TELEMETRY,
+    TRUTH,
+    Actuation,
+    Telemetry,
+    encode,
+    from_datagram,
+    to_datagram,
+)
 from bayesrace.operation.closed_loop import ClosedLoop
 from bayesrace.operation.host import HostProgram
 from bayesrace.tracks import write_track
 from bayesrace.transport import free_endpoint
 from bayesrace.vehicles import Car
+from tests import sample_messages as messages
 from tests.conftest import Circuit
+from tests.driven import blank
 from tests.programs import finish, run, start, until
 
 
@@ -125,6 +141,58 @@ def test_in_real_time_it_is_stopped_goes_on_and_its_end_is_seen(
     said_last = finish(bridged.bridge)
     assert said_last.returncode == 75
     assert "does not answer any more" in said_last.stderr
+
+
+class Sink(RemoteLink):
+    """A link that keeps what is sent."""
+
+    def __init__(self) -> None:
+        super().__init__("udp:127.0.0.1:9")
+        self.sent: list[bytes] = []
+
+    def send(self, data: bytes) -> None:
+        self.sent.append(data)
+
+
+def test_what_the_controller_does_is_known_by_its_answers(monkeypatch: pytest.MonkeyPatch) -> None:
+    now_ns = [10**9]
+    monkeypatch.setattr("bayesrace.clock.monotonic_ns", lambda: now_ns[0])
+    link = Sink()
+    driver = RemoteDriver(link, "track")
+    state = messages.state(seq=3)
+    assert driver.phase is Phase.WAITING
+    driver.forward(state, encode(state))
+    assert from_datagram(link.sent.pop()) == (STATE, state)
+    now_ns[0] += 10**10
+    assert driver.unanswered_s == 0  # it may not have been started yet
+    driver.note(to_datagram(ACTUATION, blank(Actuation, u=(0.0, 0.0), weights_version="one")))
+    driver.note(to_datagram(TELEMETRY, blank(Telemetry, seq=8, sensor_fault="frozen")))
+    assert (driver.phase, driver.ticks, driver.fault) == (Phase.DRIVING, 9, "frozen")
+    assert (driver.controller.weights_version, driver.faults["frozen"]) == ("one", 1)
+    assert driver.levels == [1, 0, 0, 0]
+    driver.forward(state, encode(state))
+    now_ns[0] += 3 * 10**9
+    driver.forward(state, encode(state))
+    assert driver.unanswered_s == 3.0
+    driver.stop()
+    driver.repeat()  # too soon
+    now_ns[0] += 2 * 10**8
+    driver.repeat()
+    said = [from_datagram(one)[0] for one in link.sent]
+    assert said.count(COMMAND) == 2
+    halted = blank(Actuation, u=(0.0, 0.0), status=Status.HALTED)
+    driver.note(to_datagram(ACTUATION, halted))
+    now_ns[0] += 2 * 10**8
+    driver.repeat()  # it has had its effect
+    assert len(link.sent) == len(said)
+    assert (driver.phase, driver.unanswered_s) == (Phase.STOPPED, 0)
+    final = messages.state(final=True)
+    driver.forward(final, encode(final))
+    now_ns[0] += 10**10
+    assert driver.unanswered_s == 0  # there is no answer to it
+    with pytest.raises(InputError):
+        driver.note(b"nothing")
+    link.close()
 
 
 @pytest.mark.parametrize("name", ["", "udp:", "udp:7450", "udp:here:port", "tcp:127.0.0.1:1", "x"])
