@@ -1,23 +1,35 @@
 """What instruments report, in words: rates, shares refused, and how well the car is known."""
 
 import math
-from typing import Final
+from typing import Any, Final, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bayesrace.controller.driver import Driver
+from bayesrace.controller.estimator import Belief
+from bayesrace.messages import State
 
-__all__ = ["Instruments"]
+__all__ = ["Instruments", "Measured"]
 
 _PERIOD_S: Final = 1.0
 """Of plant time, over which is counted."""
 
 
+class Measured(Protocol):
+    """What is known of the newest state, as :class:`.Driver` has it."""
+
+    @property
+    def newest(self) -> State | None: ...  # noqa: D102
+    @property
+    def belief(self) -> Belief | None: ...  # noqa: D102
+    @property
+    def instruments(self) -> dict[str, Any]: ...  # noqa: D102
+
+
 class Instruments:
     """Those of one driver; for its thread."""
 
-    def __init__(self, driver: Driver) -> None:
+    def __init__(self, driver: Measured) -> None:
         self._driver = driver
         self._run, self._since_s, self._span_s = (-1, -1), 0.0, 0.0
         self._before: dict[str, NDArray[np.int64]] = {}

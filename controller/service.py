@@ -2,11 +2,11 @@
 
 import threading
 from collections.abc import Callable, Mapping
-from typing import Any, Final
+from typing import Any, Final, Protocol
 
 from bayesrace import clock
-from bayesrace.controller.driver import Driver, Level, Phase
-from bayesrace.controller.instruments import Instruments
+from bayesrace.controller.driver import Level, Phase
+from bayesrace.controller.instruments import Instruments, Measured
 from bayesrace.controller.weights.manager import WeightUpdateManager
 from bayesrace.messages import (
     COMMAND,
@@ -21,10 +21,35 @@ from bayesrace.messages import (
 from bayesrace.transport import Heartbeat, Inbox, Item, Kind, Publisher, Request, decode_request
 from bayesrace.transport.hold import HOLD_MISSING, HoldWatch
 
-__all__ = ["Service"]
+__all__ = ["Driven", "Service"]
 
 _REMEDY: Final = "the car stops along the line; look at the sensors, then 'bayesrace go'"
 _LEFT_OUT: Final = "the car drives on without it"
+
+
+class Driven(Measured, Protocol):
+    """What drives, here (:class:`.Driver`) or elsewhere (:class:`.RemoteDriver`)."""
+
+    last_error: str
+    controller: Any
+
+    @property
+    def phase(self) -> Phase: ...  # noqa: D102
+    @property
+    def levels(self) -> list[int]: ...  # noqa: D102
+    @property
+    def faults(self) -> dict[str, int]: ...  # noqa: D102
+    @property
+    def fault(self) -> str: ...  # noqa: D102
+    @property
+    def faulty(self) -> str: ...  # noqa: D102
+    @property
+    def fault_text(self) -> str: ...  # noqa: D102
+    @property
+    def delay_s(self) -> float: ...  # noqa: D102
+    def count(self, name: str) -> int: ...  # noqa: D102
+    def stop(self) -> None: ...  # noqa: D102
+    def go(self) -> None: ...  # noqa: D102
 
 
 class Service:
@@ -36,7 +61,7 @@ class Service:
         inbox: Inbox,
         name: str,
         rate_hz: float,
-        driver: Driver,
+        driver: Driven,
         counters: Callable[[], Mapping[str, Scalar]],
         presence: Callable[[], Mapping[str, Any]],
     ) -> None:
@@ -177,7 +202,7 @@ class Service:
             self._command(request)
         else:
             self._weights_refused += 1
-            request.reply(False, "a control law in Python takes no weights")
+            request.reply(False, "this controller takes no weights while it drives")
 
     def _command(self, request: Request) -> None:
         command, why_not = decode_request(request)

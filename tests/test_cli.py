@@ -24,7 +24,8 @@ EVIL = "a\x1b[2Jb\x07c"
 SUBCOMMANDS = (
     "race", "drive", "report", "bench", "tracks", "cars", "raceline", "collect", "identify",
     "train", "build", "export", "limit",
-    "plant", "controller", "shadow", "status", "stop", "go", "router", "latency", "timing",
+    "plant", "controller", "bridge", "shadow", "status", "stop", "go", "router", "latency",
+    "timing",
     "fmu export", "fmu inspect", "fmu weights",
     "validate", "publish", "rollback", "learn",
     "campaign", "campaign-report", "campaign-scheduler", "campaign-worker", "tune", "paper",

@@ -50,6 +50,7 @@ from bayesrace.messages import (
     Message,
     State,
     Topic,
+    datagrams_in,
     framed,
     from_datagram,
     to_datagram,
@@ -378,6 +379,17 @@ def test_a_stream_ends_with_a_signal_or_its_reader_and_the_counts_are_said(
             said = process.stderr.read()
             assert process.wait(20) == 0
         assert (b"unsent 1" if closes else b"states 0,") in said
+
+
+def test_what_the_system_refuses_is_reported_and_the_program_goes_on(
+    host: HostProgram, circuit: Circuit
+) -> None:
+    line = [str(host.folder / PROGRAM), str(host.folder), "stdio", "--cpu", "1023"]
+    given = framed(to_datagram(STATE, at_start(circuit, lockstep=True)))
+    done = subprocess.run(line, input=given, capture_output=True, check=True, timeout=60)
+    assert b"--cpu: Invalid argument" in done.stderr
+    (answer,) = datagrams_in(done.stdout)
+    assert from_datagram(answer)[0] is ACTUATION
 
 
 def test_a_unix_socket_in_use_is_left_alone_and_one_that_was_left_is_taken(

@@ -292,7 +292,7 @@ def test_a_run_of_two_controllers_is_refused_or_no_success(rig: Rig) -> None:
 
 def test_weights_for_a_controller_without_any_are_refused_with_a_reason(rig: Rig) -> None:
     before = int(rig.director.status("controller").counters["weights_refused"])
-    with pytest.raises(InputError, match="a control law in Python takes no weights"):
+    with pytest.raises(InputError, match="this controller takes no weights while it drives"):
         rig.director.send_weights(bytes(200_000))
     assert rig.director.status("controller").counters["weights_refused"] == before + 1
 

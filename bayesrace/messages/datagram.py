@@ -15,7 +15,7 @@ from bayesrace.messages.codec import LARGEST_BYTES, decode, encode
 from bayesrace.messages.table import SERVICES, TOPICS, Service, Topic
 from bayesrace.messages.types import Message
 
-__all__ = ["datagrams_in", "framed", "from_datagram", "message_of", "to_datagram"]
+__all__ = ["datagrams_in", "framed", "from_datagram", "head_of", "message_of", "to_datagram"]
 
 Named = Topic[Any] | Service[Any, Any]
 
@@ -34,9 +34,14 @@ def message_of(named: Named) -> type[Message]:
     return kind
 
 
+def head_of(named: Named) -> bytes:
+    """What a datagram of a topic or service begins with, before the message's bytes."""
+    return _PAIR + msgspec.msgpack.encode(named.name)
+
+
 def to_datagram(topic: Named, message: Message) -> bytes:
     """The datagram of a topic's message, or of a service's request."""
-    return b"".join((_PAIR, msgspec.msgpack.encode(topic.name), encode(message)))
+    return head_of(topic) + encode(message)
 
 
 def from_datagram(data: bytes) -> tuple[Named, Message]:

@@ -43,8 +43,9 @@ _TASKS: Final = {
     "Race": "race.race race.report",
     "Prepare": "tracks.tracks tracks.cars tracks.raceline learning.collect "
     "learning.identify learning.train learning.validate export.build",
-    "Drive": "processes.plant processes.controller race.drive processes.status processes.stop "
-    "processes.go processes.router processes.doctor configuration.config configuration.certs",
+    "Drive": "processes.plant processes.controller processes.bridge race.drive processes.status "
+    "processes.stop processes.go processes.router processes.doctor configuration.config "
+    "configuration.certs",
     "Learn while driving": "learning.learn learning.publish learning.rollback",
     "Measure": "tracks.limit race.bench race.latency race.paper",
     "Evidence": "evidence.replay evidence.scenario evidence.shadow evidence.timing",

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from bayesrace.plant.process_settings import PlantSettings
     from bayesrace.transport import Endpoints
 
-__all__ = ["controller", "doctor", "go", "plant", "router", "status", "stop"]
+__all__ = ["bridge", "controller", "doctor", "go", "plant", "router", "status", "stop"]
 
 _log = logging.getLogger("bayesrace.links")
 
@@ -133,6 +133,34 @@ def controller(
         )
     main = shadow.main if role == "shadow" else process.main
     raise typer.Exit(main(chosen, driver))
+
+
+def bridge(
+    network: "Configuration",
+    link: str = options.argument("LINK", "udp:ADDRESS:PORT or unix:PATH of the controller."),
+    track: str = options.TRACK,
+    car: str = options.CAR,
+    name: str = _NAME,
+    rate: float = options.value("Rate of the controller [Hz].", 50.0, min=1.0, max=500.0),
+    endpoint: list[str] = _endpoint(
+        "Zenoh endpoint of the plant; repeatable.", "as configured; tcp/127.0.0.1:7447"
+    ),
+    listen: list[str] = _endpoint(
+        "Zenoh endpoint to listen on, for recorders; repeatable.",
+        "as configured; tcp/127.0.0.1:7448",
+    ),
+    parent_pid: int | None = options.PARENT_PID,
+) -> None:
+    """Join the network on behalf of a controller without Python, until Ctrl-C."""
+    die_with_parent(parent_pid)
+    from bayesrace.controller.bridge import main
+    from bayesrace.tracks import load_track
+    from bayesrace.vehicles import get_car
+
+    driven = get_car(car)
+    endpoints = _once_valid(network, "controller", listen=listen, connect=endpoint)
+    identity = load_track(track or driven.race_track, driven.width_m).identity
+    raise typer.Exit(main(name or driven.name, endpoints, link, identity, rate, parent_pid))
 
 
 def router(

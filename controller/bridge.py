@@ -1,0 +1,148 @@
+"""The bridge: joins Zenoh on behalf of a controller that speaks datagrams (docs/host.md).
+
+States go to it as they come, by the transport's thread, and its answers go out as they are, by a
+thread of their own; so the director, the recorder and learning see a controller as any other. The
+main thread serves requests and publishes the heartbeat.
+"""
+
+import logging
+import threading
+from collections.abc import Callable
+from contextlib import closing
+from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, Final
+
+from bayesrace import clock
+from bayesrace.controller.remote import RemoteDriver, RemoteLink
+from bayesrace.controller.service import Service
+from bayesrace.errors import InputError, RestartError
+from bayesrace.messages import (
+    ACTUATION,
+    BRAKING,
+    STATE,
+    TELEMETRY,
+    Actuation,
+    Decoder,
+    Scalar,
+    car_key,
+)
+from bayesrace.processes import die_with_parent
+from bayesrace.transport import HEARTBEAT_S, Endpoints, Inbox, Publisher, open_sessions
+from bayesrace.transport.requests import in_transport_thread
+
+__all__ = ["Bridge", "main"]
+
+_log = logging.getLogger("bayesrace.bridge")
+
+_DESERTED_S: Final = 1.0
+"""Without an answer for so long the controller is gone."""
+
+_ANSWERS: Final = (ACTUATION, BRAKING, TELEMETRY)
+
+
+class Bridge:
+    """Between an open session and a link."""
+
+    def __init__(
+        self, session: Any, name: str, endpoints: Endpoints, link: RemoteLink, track: str,
+        rate_hz: float,
+    ) -> None:  # fmt: skip
+        self._link, self.driver = link, RemoteDriver(link, track)
+        self._publishers = {one.name: Publisher(session, one, name) for one in _ANSWERS}
+        self.inbox = Inbox(session, name)
+        self._key, self._states = car_key(STATE.key, name), Decoder(STATE.message)
+        self._refused, self._sent = 0, 0
+        self._service = Service(
+            session, self.inbox, name, rate_hz, self.driver, self._counters,
+            partial(self.inbox.presence, endpoints, "plant"),
+        )  # fmt: skip
+        self.inbox.watch("plant")
+        self._listen(session)
+        self._answers = threading.Thread(target=self._carry, name="answers", daemon=True)
+        self._answers.start()
+        self.inbox.announce("controller")  # last, when everything else is in place
+
+    def _listen(self, session: Any) -> None:
+        handler = in_transport_thread(self._forward)
+        self._subscriber = session.declare_subscriber(self._key, handler)
+
+    def _forward(self, sample: Any) -> None:
+        payload = sample.payload.to_bytes()
+        state = self._states(payload)
+        if state is not None:
+            self.driver.forward(state, payload)
+            self._service.arrived_ns = clock.monotonic_ns()
+
+    def _carry(self) -> None:
+        """Answers, until the process ends."""
+        while not self._service.stopping:
+            data = self._link.receive(HEARTBEAT_S)
+            if data is None:
+                continue
+            try:
+                message = self.driver.note(data)
+            except InputError:
+                self._refused += 1
+                continue
+            newest = self.driver.newest
+            for topic in _ANSWERS:
+                if isinstance(message, topic.message) and newest is not None:
+                    self._publishers[topic.name].put(message, lockstep=newest.lockstep)
+                    self._sent += isinstance(message, Actuation)
+
+    def serve(self, renewed: Callable[[], Any] = lambda: None) -> None:
+        """Until SIGINT or SIGTERM; ``renewed``: :meth:`.Sessions.renewed`, between runs."""
+        while not self._service.stopping:
+            self._service.beat()
+            item = self.inbox.get(HEARTBEAT_S)
+            if item is not None:
+                self._service.react(item)
+            self._service.report_fault()
+            self._service.check_hold()
+            self.driver.repeat()
+            if self.driver.unanswered_s > _DESERTED_S:  # the car must not seem to be controlled
+                self._service.stopping = True
+                raise RestartError(f"the controller at {self._link.name} does not answer any more")
+            if self._silent and (session := self._service.renew(renewed)) is not None:
+                self._listen(session)
+                for publisher in self._publishers.values():
+                    publisher.bind(session)
+                self.inbox.bind(session)  # last: it announces the process
+        self._answers.join()
+
+    @property
+    def _silent(self) -> bool:
+        arrived_ns = self._service.arrived_ns
+        return arrived_ns is None or clock.monotonic_ns() - arrived_ns > 1e9
+
+    def _counters(self) -> dict[str, Scalar]:
+        return {
+            "ticks": self.driver.ticks,
+            "states_received": self._states.accepted,
+            "refused": self._states.refused + self._refused,
+            "unsent": self._link.unsent,
+            "requests_rejected": self.inbox.requests_rejected,
+            "actuations_sent": self._sent,
+        }
+
+
+def main(
+    name: str, endpoints: Endpoints, link: str, track: str, rate_hz: float,
+    parent_pid: int | None = None,
+) -> int:  # fmt: skip
+    """Bridge until SIGINT or SIGTERM; returns the exit code. Raises InputError at a bad start.
+
+    ``link``: where the controller listens; ``track``: identity of the one that it drives.
+    """
+    die_with_parent(parent_pid)
+    endpoints.check_car(name)
+    with TemporaryDirectory() as folder, open_sessions(endpoints, "controller") as sessions:
+        remote = RemoteLink(link, str(Path(folder) / "bridge"))
+        with closing(remote):
+            bridge = Bridge(sessions.current, name, endpoints, remote, track, rate_hz)
+            _log.info("bridge of car '%s' to the controller at %s", name, link)
+            with bridge.inbox.receive_signals():
+                bridge.serve(sessions.renewed)
+    return 0
