@@ -1,8 +1,12 @@
 """A controller that decides elsewhere, as its messages show it: what :class:`.Service` serves."""
 
+import os
+import select
 import socket
 from collections import Counter
 from typing import Any, Final
+
+import numpy as np
 
 from bayesrace import clock
 from bayesrace.controller.driver import Level, Phase
@@ -27,46 +31,81 @@ __all__ = ["RemoteController", "RemoteDriver", "RemoteLink"]
 
 _LARGEST: Final = 1 << 16
 _STATE: Final = head_of(STATE)
+_LONGEST_PATH: Final = 107
 _REPEAT_NS: Final = 100_000_000
 """Between two commands that have had no effect yet: datagrams may be lost."""
+_SILENT_NS: Final = 1_000_000_000
+"""Without a state for so long the controller waits for a plant."""
 
 
 class RemoteLink:
-    """Datagrams to and from a controller (docs/host.md): ``udp:ADDRESS:PORT``, ``unix:PATH``."""
+    """Datagrams to and from a controller (docs/host.md): ``udp:ADDRESS:PORT``, ``unix:PATH``.
+
+    What others send is not received.
+    """
 
     def __init__(self, name: str, own: str = "") -> None:
-        """``own``: path that a Unix socket gets, to which the answers come."""
+        """``own``: path that a Unix socket gets, to which the answers come. InputError for what is
+        no link."""
         self.name = name
-        kind, _, where = name.partition(":")
-        address, _, port = where.rpartition(":")
-        unix = kind == "unix"
-        if not where or kind not in ("udp", "unix") or not (unix or (address and port.isdigit())):
-            raise InputError(f"'{name}' is no link: use udp:ADDRESS:PORT or unix:PATH")
-        self._socket = socket.socket(socket.AF_UNIX if unix else socket.AF_INET, socket.SOCK_DGRAM)
-        if unix:
-            self._socket.bind(own)
-        self._there: Any = where if unix else (address, int(port))
+        kind, _, self._path = name.partition(":")
+        self._address: str | None = None
         self.unsent = 0
         """Datagrams that could not be sent: nobody listens there, or it is held up."""
+        if kind == "unix" and self._path and len(os.fsencode(self._path)) <= _LONGEST_PATH:
+            self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+            self._socket.bind(own)
+            self._address = self._path
+        elif kind == "udp":
+            self._socket = _connected(name, self._path)
+        else:
+            raise InputError(f"'{name}' is no link: use udp:ADDRESS:PORT or unix:PATH")
+        self._socket.setblocking(False)
+        self._poll = select.poll()
+        self._poll.register(self._socket, select.POLLIN)
 
     def send(self, data: bytes) -> None:
-        """Sends a datagram, or counts that it could not; from any thread."""
+        """Sends a datagram, or counts that it could not; never waits; from any thread."""
         try:
-            self._socket.sendto(data, socket.MSG_DONTWAIT, self._there)
+            if self._address is None:
+                self._socket.send(data)
+            else:
+                self._socket.sendto(data, self._address)
         except OSError:
             self.unsent += 1
 
     def receive(self, timeout_s: float) -> bytes | None:
         """The next datagram; None if there is none in time."""
-        self._socket.settimeout(timeout_s)
-        try:
-            return self._socket.recv(_LARGEST)
-        except OSError:
+        if not self._poll.poll(1e3 * timeout_s):
             return None
+        try:
+            data, sender = self._socket.recvfrom(_LARGEST)
+        except OSError:  # of a datagram that was sent before
+            self.unsent += 1
+            return None
+        return data if self._address is None or sender == self._address else None
 
     def close(self) -> None:
         """No more datagrams."""
         self._socket.close()
+
+
+def _connected(name: str, where: str) -> socket.socket:
+    host, _, port = where.rpartition(":")
+    numeric = socket.AI_NUMERICHOST | socket.AI_NUMERICSERV
+    try:
+        if not host or not 0 < int(port) < 1 << 16:
+            raise ValueError
+        (found, *_) = socket.getaddrinfo(
+            host.removeprefix("[").removesuffix("]"), port, type=socket.SOCK_DGRAM, flags=numeric
+        )
+        made = socket.socket(found[0], socket.SOCK_DGRAM)
+        made.connect(found[4])
+    except (OSError, ValueError, OverflowError):
+        raise InputError(
+            f"'{name}' is no link: use udp:ADDRESS:PORT, such as udp:127.0.0.1:7450, or unix:PATH"
+        ) from None
+    return made
 
 
 class RemoteController:
@@ -83,66 +122,86 @@ class RemoteController:
 class RemoteDriver:
     """Forwards states and commands; knows of the driving what the answers say.
 
-    :meth:`forward` and :meth:`note` are called by the transport's and by the link's thread, all
-    else by the one that serves.
+    :meth:`take` and :meth:`forward` are called by the transport's thread, :meth:`note` by the
+    link's, all else by the one that serves.
     """
-
-    belief: Belief | None = None
-    """What is estimated, the telemetry says."""
 
     def __init__(self, link: RemoteLink, track: str) -> None:
         self.controller = RemoteController(track)
-        self.last_error, self.faulty, self.delay_s = "", "", 0.0
+        self.last_error, self.faulty, self.delay_s = "is not reported", "", 0.0
         self.newest: State | None = None
-        """The newest state that was forwarded."""
+        """The newest state that has come."""
+        self.belief: Belief | None = None
+        """What the controller estimates the car's state to be; None: it is measured."""
         self.instruments: dict[str, Any] = {}
+        self.answers = self.reports = self.misses = 0
+        """Actuations and telemetry so far; of those, sent after their deadline."""
         self._link = link
         self._answer: Actuation | None = None
         self._report: Telemetry | None = None
         self._levels: Counter[int] = Counter()
         self._counts: Counter[str] = Counter()
-        self._asked_ns = 0
-        """Monotonic clock at the first state since the newest answer; 0: none has come."""
-        self._wanted, self._said, self._said_ns = "", 0, 0
+        self._unanswered_since_ns = self._arrived_ns = 0
+        """Monotonic clock at the first state since the newest answer, 0 if none has come since; at
+        the newest state."""
+        self._wanted, self._commands, self._commanded_ns = "", 0, 0
 
-    def forward(self, state: State, payload: bytes) -> None:
-        """A state, as it has come."""
-        self.newest = state  # before its answer can come
-        if not self._asked_ns and not state.final:
-            self._asked_ns = clock.monotonic_ns()
+    def take(self, state: State) -> None:
+        """A state has come, to be forwarded next."""
+        self.newest, self._arrived_ns = state, clock.monotonic_ns()
+        if state.final:
+            self._unanswered_since_ns = 0  # it gets no answer, nor may those before it
+        elif not self._unanswered_since_ns:
+            self._unanswered_since_ns = self._arrived_ns
+
+    def forward(self, payload: bytes) -> None:
+        """The state that was taken, as it has come."""
         self._link.send(_STATE + payload)
 
-    def note(self, data: bytes) -> Message | None:
-        """What a datagram of the controller says; None: nothing that is known."""
+    def note(self, data: bytes) -> Message:
+        """What a datagram of the controller says; InputError if it is none."""
         _, message = from_datagram(data)
         if isinstance(message, Actuation):
-            self._answer, self._asked_ns = message, 0
+            self._answer, self._unanswered_since_ns = message, 0
             self.controller.weights_version = message.weights_version
+            self.answers += 1
         elif isinstance(message, Telemetry):
-            self._report, self.delay_s = message, message.delay_s
-            self._levels[message.fallback] += message.status != Status.HALTED
-            self._counts[message.sensor_fault] += bool(message.sensor_fault)
-            self._counts["second_starts"] += message.second_start > 0
-            self._counts["creeping"] += message.second_start == 3
-            self._counts["failed"] += message.status == Status.STEP_FAILED
+            self._note_report(message)
         return message
+
+    def _note_report(self, report: Telemetry) -> None:
+        self._report, self.delay_s = report, report.delay_s
+        self.reports += 1
+        self.misses += report.missed
+        self._levels[report.fallback] += report.status != Status.HALTED
+        self._counts[report.sensor_fault] += bool(report.sensor_fault)
+        self._counts["second_starts"] += report.second_start > 0
+        self._counts["creeping"] += report.second_start == 3
+        self._counts["failed"] += report.status == Status.STEP_FAILED
+        self.belief = None
+        if report.estimate:
+            covariance = np.diag(np.square(report.deviation))
+            self.belief = Belief(0.0, np.array(report.estimate), covariance)
 
     @property
     def phase(self) -> Phase:
         """Where in its life the controller is."""
-        if self._answer is None or self._report is None:
+        answer, newest, report = self._answer, self.newest, self._report
+        silent = clock.monotonic_ns() - self._arrived_ns > _SILENT_NS
+        if answer is None or newest is None or newest.final or silent:
             return Phase.WAITING
-        if self._answer.status == Status.HALTED:
+        if (answer.epoch, answer.run) != (newest.epoch, newest.run):
+            return Phase.WAITING
+        if answer.status == Status.HALTED:
             return Phase.STOPPED
-        return Phase.DRIVING if self._report.fallback == Level.SOLUTION else Phase.FALLBACK
+        fallen_back = report is not None and report.fallback != Level.SOLUTION
+        return Phase.FALLBACK if fallen_back else Phase.DRIVING
 
     @property
     def unanswered_s(self) -> float:
-        """For how long a state has had no answer; 0 before the first answer of all: the controller
-        may start later."""
-        asked_ns = self._asked_ns
-        waits = asked_ns and self._answer is not None
-        return (clock.monotonic_ns() - asked_ns) * 1e-9 if waits else 0.0
+        """For how long a state has had no answer."""
+        since_ns = self._unanswered_since_ns
+        return (clock.monotonic_ns() - since_ns) * 1e-9 if since_ns else 0.0
 
     @property
     def ticks(self) -> int:
@@ -182,15 +241,16 @@ class RemoteDriver:
         self._command("go")
 
     def repeat(self) -> None:
-        """The newest command, while it has had no effect."""
-        stopped = self.phase is Phase.STOPPED
-        driven = self.phase is not Phase.WAITING
-        due = clock.monotonic_ns() - self._said_ns > _REPEAT_NS
-        if driven and due and self._wanted and stopped != (self._wanted == "stop"):
+        """The newest command, while the car is driven and it has had no effect."""
+        phase = self.phase
+        opposite = (phase is Phase.STOPPED) != (self._wanted == "stop")
+        due = clock.monotonic_ns() - self._commanded_ns > _REPEAT_NS
+        if self._wanted and due and opposite and phase is not Phase.WAITING:
             self._command(self._wanted)
 
     def _command(self, command: str) -> None:
         now_ns = clock.monotonic_ns()
-        message = Command(seq=self._said, source_time_ns=now_ns, command=command, text="bridge")
+        message = Command(seq=self._commands, source_time_ns=now_ns, command=command, text="bridge")
+        self._wanted, self._commanded_ns = command, now_ns
+        self._commands += 1
         self._link.send(to_datagram(COMMAND, message))
-        self._wanted, self._said, self._said_ns = command, self._said + 1, now_ns

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from msgspec.structs import replace
 
 from bayesrace.codegen.build import PROGRAM
 from bayesrace.controller.assembly import compiled_controller
@@ -83,17 +84,15 @@ def bridged(
     words = [str(made.folder / PROGRAM), str(made.folder), link, "--telemetry"]
     host = subprocess.Popen(words, stderr=subprocess.PIPE, text=True)
     assert host.stderr is not None
-    assert "ready" in host.stderr.readline()
     plant = start("plant", "--endpoint", plant_at)
     bridge = start("bridge", link, "--track", track, "--endpoint", plant_at, "--listen", bridge_at)
-    yield Bridged(host, bridge, ("--endpoint", plant_at, "--endpoint", bridge_at), track)
-    alive = bridge.poll() is None
-    for one in (bridge, plant, host):
-        one.terminate()
-    if alive:
-        assert finish(bridge).returncode == 0
-    finish(plant)
-    host.communicate(timeout=60)
+    try:
+        assert "ready" in host.stderr.readline()
+        yield Bridged(host, bridge, ("--endpoint", plant_at, "--endpoint", bridge_at), track)
+    finally:
+        for one in (bridge, plant, host):
+            one.terminate()
+            one.communicate(timeout=60)
 
 
 @pytest.mark.check
@@ -140,7 +139,7 @@ def test_in_real_time_it_is_stopped_goes_on_and_its_end_is_seen(
     assert {"stop", "go"} <= set(events)
     said_last = finish(bridged.bridge)
     assert said_last.returncode == 75
-    assert "does not answer any more" in said_last.stderr
+    assert "does not answer" in said_last.stderr
 
 
 class Sink(RemoteLink):
@@ -154,48 +153,138 @@ class Sink(RemoteLink):
         self.sent.append(data)
 
 
+def answered(**changes: Any) -> bytes:
+    values = {"epoch": 1, "run": 1, "u": (0.0, 0.0)}
+    return to_datagram(ACTUATION, blank(Actuation, **(values | changes)))
+
+
+def phase_of(driver: RemoteDriver) -> Phase:
+    """Read anew: mypy takes it for a constant."""
+    return driver.phase
+
+
 def test_what_the_controller_does_is_known_by_its_answers(monkeypatch: pytest.MonkeyPatch) -> None:
-    now_ns = [10**9]
+    now_ns = [10**10]
     monkeypatch.setattr("bayesrace.clock.monotonic_ns", lambda: now_ns[0])
     link = Sink()
-    driver = RemoteDriver(link, "track")
-    state = messages.state(seq=3)
-    assert driver.phase is Phase.WAITING
-    driver.forward(state, encode(state))
+    driver, state = RemoteDriver(link, "track"), messages.state(seq=3)
+    assert phase_of(driver) is Phase.WAITING
+    driver.take(state)
+    driver.forward(encode(state))
     assert from_datagram(link.sent.pop()) == (STATE, state)
-    now_ns[0] += 10**10
-    assert driver.unanswered_s == 0  # it may not have been started yet
-    driver.note(to_datagram(ACTUATION, blank(Actuation, u=(0.0, 0.0), weights_version="one")))
-    driver.note(to_datagram(TELEMETRY, blank(Telemetry, seq=8, sensor_fault="frozen")))
-    assert (driver.phase, driver.ticks, driver.fault) == (Phase.DRIVING, 9, "frozen")
+    now_ns[0] += 3 * 10**8
+    driver.take(state)
+    now_ns[0] += 10**8
+    assert driver.unanswered_s == 0.4
+    driver.note(answered(weights_version="one"))
+    report = blank(Telemetry, seq=8, sensor_fault="frozen", missed=True)
+    driver.note(to_datagram(TELEMETRY, report))
+    assert (phase_of(driver), driver.ticks, driver.fault) == (Phase.DRIVING, 9, "frozen")
     assert (driver.controller.weights_version, driver.faults["frozen"]) == ("one", 1)
-    assert driver.levels == [1, 0, 0, 0]
-    driver.forward(state, encode(state))
-    now_ns[0] += 3 * 10**9
-    driver.forward(state, encode(state))
-    assert driver.unanswered_s == 3.0
+    assert (driver.levels, driver.misses, driver.unanswered_s) == ([1, 0, 0, 0], 1, 0)
+    estimated = replace(report, estimate=(1.0,) * 9, deviation=(0.5,) * 9, fallback=2)
+    driver.note(to_datagram(TELEMETRY, estimated))
+    assert driver.belief is not None
+    assert driver.belief.covariance[2, 2] == 0.25
+    assert phase_of(driver) is Phase.FALLBACK
     driver.stop()
     driver.repeat()  # too soon
     now_ns[0] += 2 * 10**8
     driver.repeat()
-    said = [from_datagram(one)[0] for one in link.sent]
-    assert said.count(COMMAND) == 2
-    halted = blank(Actuation, u=(0.0, 0.0), status=Status.HALTED)
-    driver.note(to_datagram(ACTUATION, halted))
+    assert [from_datagram(one)[0] for one in link.sent] == [COMMAND, COMMAND]
+    driver.note(answered(status=Status.HALTED))
     now_ns[0] += 2 * 10**8
     driver.repeat()  # it has had its effect
-    assert len(link.sent) == len(said)
-    assert (driver.phase, driver.unanswered_s) == (Phase.STOPPED, 0)
-    final = messages.state(final=True)
-    driver.forward(final, encode(final))
-    now_ns[0] += 10**10
-    assert driver.unanswered_s == 0  # there is no answer to it
+    assert len(link.sent) == 2
+    assert phase_of(driver) is Phase.STOPPED
     with pytest.raises(InputError):
-        driver.note(b"nothing")
+        driver.note(b"\x92\xa5state" + b"\x91" * 5000)
     link.close()
 
 
-@pytest.mark.parametrize("name", ["", "udp:", "udp:7450", "udp:here:port", "tcp:127.0.0.1:1", "x"])
+def test_between_runs_it_waits_whatever_the_last_answer_was(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Else the end of a held run would be taken for a missing director."""
+    now_ns = [10**10]
+    monkeypatch.setattr("bayesrace.clock.monotonic_ns", lambda: now_ns[0])
+    driver = RemoteDriver(Sink(), "track")
+    driver.take(messages.state())
+    driver.note(answered())
+    assert phase_of(driver) is Phase.DRIVING
+    driver.take(messages.state(seq=1))
+    driver.take(messages.state(seq=2, final=True))
+    now_ns[0] += 9 * 10**8
+    assert (phase_of(driver), driver.unanswered_s) == (Phase.WAITING, 0)
+    driver.take(messages.state(seq=3, run=2))
+    assert phase_of(driver) is Phase.WAITING  # no answer yet
+    driver.note(answered(run=2))
+    assert phase_of(driver) is Phase.DRIVING
+    now_ns[0] += 11 * 10**8
+    assert phase_of(driver) is Phase.WAITING  # no states any more
+
+
+def test_a_link_never_waits_to_send_and_hears_the_controller_alone(tmp_path: Path) -> None:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as held_up:
+        held_up.bind(str(tmp_path / "host"))
+        link = RemoteLink(f"unix:{tmp_path / 'host'}", str(tmp_path / "own"))
+        for _ in range(5000):
+            link.send(bytes(1000))
+        assert link.unsent > 0
+        held_up.sendto(b"answer", str(tmp_path / "own"))
+        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as stranger:
+            stranger.bind(str(tmp_path / "stranger"))
+            stranger.sendto(b"lie", str(tmp_path / "own"))
+        assert [link.receive(0.1) for _ in range(3)] == [b"answer", None, None]
+        link.close()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as host:
+        host.bind(("127.0.0.1", 0))
+        link = RemoteLink(f"udp:127.0.0.1:{host.getsockname()[1]}")
+        link.send(b"state")
+        _, bridge = host.recvfrom(100)
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
+            stranger.sendto(b"lie", bridge)
+        host.sendto(b"answer", bridge)
+        assert [link.receive(0.1) for _ in range(2)] == [b"answer", None]
+    for _ in range(3):  # nobody is there any more
+        link.send(b"state")
+        assert link.receive(0.1) is None
+    assert link.unsent > 0
+    link.close()
+
+
+@pytest.mark.check
+@pytest.mark.wall_clock
+def test_without_a_controller_the_bridge_ends_and_the_run_with_it(
+    circuit: Circuit, tmp_path: Path
+) -> None:
+    track = tmp_path / "track.csv"
+    write_track(track, circuit.track)
+    plant_at, bridge_at = free_endpoint(), free_endpoint()
+    where = ("--endpoint", plant_at, "--endpoint", bridge_at)
+    plant = start("plant", "--endpoint", plant_at)
+    bridge = start("bridge", "udp:127.0.0.1:9", "--track", track, "--endpoint", plant_at,
+                   "--listen", bridge_at)  # fmt: skip
+    try:
+        log = tmp_path / "drive.mcap"
+        drive = start("drive", "--track", track, *where, "--log", log, "--mode", "realtime")
+        assert finish(drive).returncode == 2
+        done = finish(bridge)
+        assert done.returncode == 75
+        assert "udp:127.0.0.1:9 does not answer: start it first" in done.stderr
+    finally:
+        for one in (plant, bridge):
+            one.terminate()
+            finish(one)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("", "udp:", "udp:7450", "udp:here:port", "udp:127.0.0.1:99999", "tcp:127.0.0.1:1", "x"),
+        "unix:" + 108 * "x",
+    ],
+)
 def test_a_link_that_is_none_is_named(name: str) -> None:
-    with pytest.raises(InputError, match="use udp:ADDRESS:PORT or unix:PATH"):
+    with pytest.raises(InputError, match="is no link: use udp:ADDRESS:PORT"):
         RemoteLink(name)

@@ -49,7 +49,7 @@ def from_datagram(data: bytes) -> tuple[Named, Message]:
     try:
         name, payload = _read(data)
         topic = _NAMED[name]
-    except (ValueError, KeyError) as error:
+    except (ValueError, KeyError, RecursionError) as error:
         raise InputError(f"no datagram of a topic: {error}") from None
     return topic, decode(message_of(topic), bytes(payload))
 

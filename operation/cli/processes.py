@@ -138,10 +138,10 @@ def controller(
 def bridge(
     network: "Configuration",
     link: str = options.argument("LINK", "udp:ADDRESS:PORT or unix:PATH of the controller."),
-    track: str = options.TRACK,
+    track: str = options.TRACK_GIVEN,
     car: str = options.CAR,
     name: str = _NAME,
-    rate: float = options.value("Rate of the controller [Hz].", 50.0, min=1.0, max=500.0),
+    rate: float = options.value("The controller's own --rate [Hz].", 50.0, min=1.0, max=500.0),
     endpoint: list[str] = _endpoint(
         "Zenoh endpoint of the plant; repeatable.", "as configured; tcp/127.0.0.1:7447"
     ),
@@ -159,7 +159,7 @@ def bridge(
 
     driven = get_car(car)
     endpoints = _once_valid(network, "controller", listen=listen, connect=endpoint)
-    identity = load_track(track or driven.race_track, driven.width_m).identity
+    identity = load_track(track, driven.width_m).identity
     raise typer.Exit(main(name or driven.name, endpoints, link, identity, rate, parent_pid))
 
 
