@@ -54,7 +54,9 @@ class Bridge:
         rate_hz: float,
     ) -> None:  # fmt: skip
         self._link, self.driver = link, RemoteDriver(link, track)
-        self._publishers = {one.name: Publisher(session, one, name) for one in _ANSWERS}
+        self._publishers: dict[str, Publisher[Any]] = {
+            one.name: Publisher(session, one, name) for one in _ANSWERS
+        }
         self.inbox = Inbox(session, name)
         self._key, self._states = car_key(STATE.key, name), Decoder(STATE.message)
         self._refused = 0
@@ -103,15 +105,14 @@ class Bridge:
 
     def _publish(self, data: bytes) -> None:
         try:
-            message = self.driver.note(data)
+            name, message = self.driver.note(data)
         except InputError:
             self._refused += 1
             return
-        newest = self.driver.newest
-        for topic in _ANSWERS:
-            if isinstance(message, topic.message) and newest is not None:
-                with self._publishing:
-                    self._publishers[topic.name].put(message, lockstep=newest.lockstep)
+        newest, publisher = self.driver.newest, self._publishers.get(name)
+        if newest is not None and publisher is not None:
+            with self._publishing:
+                publisher.put(message, lockstep=newest.lockstep)
 
     def serve(self, renewed: Callable[[], Any] = lambda: None) -> None:
         """Until SIGINT or SIGTERM; ``renewed``: :meth:`.Sessions.renewed`, between runs.
@@ -128,7 +129,7 @@ class Bridge:
                 self._check_hold()
                 self.driver.repeat()
                 self._check_controller()
-                if self._silent:
+                if self.driver.silent:
                     self._renew(renewed)
         finally:
             self._service.stopping = True
@@ -147,18 +148,13 @@ class Bridge:
             raise InputError(f"the controller at {self._link.name} needs --telemetry")
 
     def _renew(self, renewed: Callable[[], Any]) -> None:
-        with self._publishing:  # nobody publishes while there is no session
+        with self._publishing:  # no answer is published while there is no session
             if (session := self._service.renew(renewed)) is None:
                 return
             self._listen(session)
             for publisher in self._publishers.values():
                 publisher.bind(session)
             self.inbox.bind(session)  # last: it announces the process
-
-    @property
-    def _silent(self) -> bool:
-        arrived_ns = self._service.arrived_ns
-        return arrived_ns is None or clock.monotonic_ns() - arrived_ns > 1e9
 
     def _counters(self) -> dict[str, Scalar]:
         return {

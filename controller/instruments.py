@@ -19,11 +19,16 @@ class Measured(Protocol):
     """What is known of the newest state, as :class:`.Driver` has it."""
 
     @property
-    def newest(self) -> State | None: ...  # noqa: D102
+    def newest(self) -> State | None:
+        """The newest state that counts."""
+
     @property
-    def belief(self) -> Belief | None: ...  # noqa: D102
+    def belief(self) -> Belief | None:
+        """What it is estimated to be; None: it is measured, or nothing is known."""
+
     @property
-    def instruments(self) -> dict[str, Any]: ...  # noqa: D102
+    def instruments(self) -> dict[str, Any]:
+        """What has become of the readings of each instrument: a br_instrument."""
 
 
 class Instruments:

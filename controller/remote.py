@@ -51,7 +51,7 @@ class RemoteLink:
         kind, _, self._path = name.partition(":")
         self._address: str | None = None
         self.unsent = 0
-        """Datagrams that could not be sent: nobody listens there, or it is held up."""
+        """Datagrams that could not be sent: no process listens there, or it is held up."""
         if kind == "unix" and self._path and len(os.fsencode(self._path)) <= _LONGEST_PATH:
             self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
             self._socket.bind(own)
@@ -158,16 +158,16 @@ class RemoteDriver:
         """The state that was taken, as it has come."""
         self._link.send(_STATE + payload)
 
-    def note(self, data: bytes) -> Message:
-        """What a datagram of the controller says; InputError if it is none."""
-        _, message = from_datagram(data)
+    def note(self, data: bytes) -> tuple[str, Message]:
+        """Topic and message of a datagram of the controller; InputError if it is none."""
+        topic, message = from_datagram(data)
         if isinstance(message, Actuation):
             self._answer, self._unanswered_since_ns = message, 0
             self.controller.weights_version = message.weights_version
             self.answers += 1
         elif isinstance(message, Telemetry):
             self._note_report(message)
-        return message
+        return topic.name, message
 
     def _note_report(self, report: Telemetry) -> None:
         self._report, self.delay_s = report, report.delay_s
@@ -187,8 +187,7 @@ class RemoteDriver:
     def phase(self) -> Phase:
         """Where in its life the controller is."""
         answer, newest, report = self._answer, self.newest, self._report
-        silent = clock.monotonic_ns() - self._arrived_ns > _SILENT_NS
-        if answer is None or newest is None or newest.final or silent:
+        if answer is None or newest is None or newest.final or self.silent:
             return Phase.WAITING
         if (answer.epoch, answer.run) != (newest.epoch, newest.run):
             return Phase.WAITING
@@ -196,6 +195,11 @@ class RemoteDriver:
             return Phase.STOPPED
         fallen_back = report is not None and report.fallback != Level.SOLUTION
         return Phase.FALLBACK if fallen_back else Phase.DRIVING
+
+    @property
+    def silent(self) -> bool:
+        """Whether no state has come for long."""
+        return clock.monotonic_ns() - self._arrived_ns > _SILENT_NS
 
     @property
     def unanswered_s(self) -> float:

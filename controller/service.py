@@ -34,22 +34,41 @@ class Driven(Measured, Protocol):
     controller: Any
 
     @property
-    def phase(self) -> Phase: ...  # noqa: D102
+    def phase(self) -> Phase:
+        """Where in its life it is."""
+
     @property
-    def levels(self) -> list[int]: ...  # noqa: D102
+    def levels(self) -> list[int]:
+        """Cycles so far by level of the fallback."""
+
     @property
-    def faults(self) -> dict[str, int]: ...  # noqa: D102
+    def faults(self) -> dict[str, int]:
+        """States so far by what speaks against them."""
+
     @property
-    def fault(self) -> str: ...  # noqa: D102
+    def fault(self) -> str:
+        """What speaks against the newest state; empty: nothing."""
+
     @property
-    def faulty(self) -> str: ...  # noqa: D102
+    def faulty(self) -> str:
+        """The instrument that is not believed; empty: each is."""
+
     @property
-    def fault_text(self) -> str: ...  # noqa: D102
+    def fault_text(self) -> str:
+        """The fault as a sentence."""
+
     @property
-    def delay_s(self) -> float: ...  # noqa: D102
-    def count(self, name: str) -> int: ...  # noqa: D102
-    def stop(self) -> None: ...  # noqa: D102
-    def go(self) -> None: ...  # noqa: D102
+    def delay_s(self) -> float:
+        """Delay that is compensated."""
+
+    def count(self, name: str) -> int:
+        """A count of the control cycle by its name."""
+
+    def stop(self) -> None:
+        """Slow down to standstill, and stay."""
+
+    def go(self) -> None:
+        """Drive."""
 
 
 class Service:

@@ -196,6 +196,16 @@ def plant(host: HostProgram, tmp_path: Path, request: pytest.FixtureRequest) -> 
     assert not (tmp_path / "host").exists()
 
 
+@contextlib.contextmanager
+def another(plant: socket.socket, folder: Path) -> Iterator[socket.socket]:
+    """A second socket that is connected to the program."""
+    with socket.socket(plant.family, socket.SOCK_DGRAM) as one:
+        one.bind(("127.0.0.1", 0) if plant.family == socket.AF_INET else str(folder / "other"))
+        one.connect(plant.getpeername())
+        one.settimeout(20.0)
+        yield one
+
+
 def free_port() -> int:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
         free.bind(("127.0.0.1", 0))
@@ -254,9 +264,7 @@ def test_no_other_sender_ends_the_run_or_takes_its_answers(
     state = at_start(circuit)
     one.send(to_datagram(STATE, state))
     received(one, ACTUATION)
-    with socket.socket(one.family, socket.SOCK_DGRAM) as stranger:
-        stranger.bind(("127.0.0.1", 0) if one.family == socket.AF_INET else str(tmp_path / "other"))
-        stranger.connect(one.getpeername())
+    with another(one, tmp_path) as stranger:
         stranger.settimeout(0.2)
         foreign = replace(state, epoch=8, final=True)
         burst = [replace(foreign, seq=k, time_s=0.02 * k, final=False) for k in range(20)]
@@ -279,8 +287,7 @@ def test_a_stop_is_obeyed_whoever_sends_it_and_a_go(
 ) -> None:
     one, process = plant
     state = at_start(circuit, lockstep=True)
-    with socket.socket(one.family, socket.SOCK_DGRAM) as other:
-        other.connect(one.getpeername())
+    with another(one, tmp_path) as other:
         statuses = []
         for k, said in enumerate(("", "stop", "", "go", "")):
             if said:
@@ -304,10 +311,7 @@ def test_another_plant_is_answered_once_the_first_is_silent(
     state = at_start(circuit, lockstep=True)
     one.send(to_datagram(STATE, state))
     received(one, ACTUATION)
-    with socket.socket(one.family, socket.SOCK_DGRAM) as other:
-        other.bind(("127.0.0.1", 0) if one.family == socket.AF_INET else str(tmp_path / "other"))
-        other.connect(one.getpeername())
-        other.settimeout(20.0)
+    with another(one, tmp_path) as other:
         time.sleep(1.1)
         other.send(to_datagram(STATE, replace(state, epoch=8)))
         assert received(other, ACTUATION).epoch == 8

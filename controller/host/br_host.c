@@ -1,6 +1,5 @@
 /* See br_host.h. */
 #define _GNU_SOURCE /* clock_nanosleep */
-#include <errno.h>
 #include <math.h>
 #include <stdio.h>
 #include <stdlib.h>
@@ -149,8 +148,8 @@ static arrival observe(br_host *host, const br_state_message *state, const br_ad
 
 static int silent(const br_host *host) { return br_now_ns() - host->timing.arrived_ns > SILENT_NS; }
 
-/* Whether a datagram is from another than the plant that is driven for: until that has ended its
- * run or is silent, nobody else has a say. */
+/* Whether a datagram is from another sender than the plant that is driven for. Until that plant has
+ * ended its run or is silent, the states of other senders are ignored. */
 static int from_other(const br_host *host) {
     if (!host->has_state || host->state.final || silent(host)) return 0;
     return !br_same_address(&host->link.from, &host->link.peer);
@@ -171,7 +170,7 @@ static int reads_state(br_host *host, size_t size) {
            host->incoming.actuation_delays_count % 3 == 0; /* whole rows */
 }
 
-/* Stop and go, whoever says it. */
+/* Carries out a command to stop or go, from any sender; whether the datagram was one. */
 static int obeys(br_host *host, size_t size) {
     if (!reads(host, size, &BR_COMMAND_TABLE, &host->command)) return 0;
     if (!strcmp(host->command.command, "stop"))

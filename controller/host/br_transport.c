@@ -56,7 +56,7 @@ static int open_udp(br_link *link, const char *where, char *text, size_t size) {
     return unbound ? refused(text, size, where, strerror(errno)) : 0;
 }
 
-/* Removes the socket that a killed process has left: one that nobody listens at. */
+/* Removes a socket file that a killed process has left, to which no process listens any more. */
 static void remove_left_over(const struct sockaddr_un *at) {
     struct stat there;
     if (lstat(at->sun_path, &there) || !S_ISSOCK(there.st_mode)) return;

@@ -26,7 +26,7 @@ typedef struct br_transport br_transport;
 
 typedef struct {
     struct sockaddr_storage at;
-    socklen_t size; /* 0: nobody */
+    socklen_t size; /* 0: there is no address */
 } br_address;
 
 typedef struct {
