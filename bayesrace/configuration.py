@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, Field, ValidationError, model_validator
 
 from bayesrace.defaults import CONFIGURATION_VARIABLE
 from bayesrace.errors import InputError, faults_in
@@ -30,6 +30,7 @@ from bayesrace.transport.endpoints import (
     ZenohSettings,
     address_of,
 )
+from bayesrace.units import Section
 
 __all__ = [
     "Configuration", "DriveSettings", "NetworkSettings", "TlsSettings", "as_toml", "configured",
@@ -39,10 +40,6 @@ __all__ = [
 _LISTENERS: Final = "plant", "controller", "shadow", "router"
 
 
-class _Section(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
-
 def _port(endpoint: str) -> tuple[str, int, bool]:
     """What one process alone can listen on."""
     address = address_of(endpoint)
@@ -50,7 +47,7 @@ def _port(endpoint: str) -> tuple[str, int, bool]:
     return host or endpoint, address.port, address.protocol in ("udp", "quic")
 
 
-class NetworkSettings(_Section):
+class NetworkSettings(Section):
     """Where the processes are: an endpoint is protocol/host:port, a protocol tcp or tls."""
 
     mode: Literal["direct", "router"] | None = Field(
@@ -109,7 +106,7 @@ class NetworkSettings(_Section):
         return self.router if self.by_router else (*self.plant, *self.controller, *self.shadow)
 
 
-class TlsSettings(_Section):
+class TlsSettings(Section):
     """Certificates, as 'bayesrace certs' makes them. With a folder every link is encrypted."""
 
     folder: Path | None = Field(None, description="holds a folder for each certificate")
@@ -135,7 +132,7 @@ class TlsSettings(_Section):
         return [Credentials.read(folder) for folder in sorted({one.parent for one in found})]
 
 
-class DriveSettings(_Section):
+class DriveSettings(Section):
     """How runs are driven."""
 
     hold_to_run: bool = Field(
@@ -149,7 +146,7 @@ class DriveSettings(_Section):
     )
 
 
-class Configuration(_Section):
+class Configuration(Section):
     """Everything in the file; what is left out has its default."""
 
     network: NetworkSettings = NetworkSettings()

@@ -10,7 +10,7 @@ from typing import Final
 
 __all__ = [
     "CONFIGURATION_VARIABLE", "DEFAULT_CAR", "HEARTBEAT_VARIABLE", "LEAST_LOSS_S", "MAX_POINTS",
-    "MAX_WEIGHTS_BYTES", "Option",
+    "MAX_WEIGHTS_BYTES", "PATH_ROWS", "POINTS", "Option",
 ]  # fmt: skip
 
 CONFIGURATION_VARIABLE: Final = "BAYESRACE_CONFIG"
@@ -24,6 +24,12 @@ DEFAULT_CAR: Final = "orca"
 
 MAX_POINTS: Final = 4096
 """Training points per output at most, so that weights with their samples are not too large."""
+
+PATH_ROWS: Final = 8192
+"""Rows of the racing line's table that a controller has room for."""
+
+POINTS: Final = (400, 300, 200, 150, 100, 50)
+"""Training points per output: by default, and what is tried where fewer may be enough."""
 
 MAX_WEIGHTS_BYTES: Final = 1 << 20
 """Largest weights file, which is the largest message between processes."""

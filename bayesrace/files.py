@@ -6,6 +6,7 @@ import fcntl
 import os
 import re
 import shutil
+import stat
 import tempfile
 import time
 import tomllib
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from pydantic import BaseModel
 
 __all__ = [
+    "check_private",
     "claimed",
     "clear_partials",
     "held",
@@ -133,6 +135,14 @@ def write_whole(path: Path, data: str | bytes, *, private: bool = False) -> None
         if private:
             partial.touch(0o600, exist_ok=False)
         partial.write_bytes(data.encode() if isinstance(data, str) else data)
+
+
+def check_private(key: Path) -> None:
+    """InputError if others can read the key: theirs may be a group, where root owns the file."""
+    status = key.stat()
+    forbidden = 0o077 if status.st_uid else 0o027
+    if stat.S_IMODE(status.st_mode) & (forbidden if os.geteuid() else 0o077):
+        raise InputError(f"others can read the private key {key}: chmod 600 {key}")
 
 
 @contextmanager

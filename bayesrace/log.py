@@ -2,8 +2,9 @@
 
 Messages are JSON, one channel a key, with a JSON schema for each kind of message, in compressed
 chunks with an index: Foxglove, Lichtblick and PlotJuggler open the file, and play it as fast as the
-car drove, also what was simulated faster. :class:`LogReader` reads every whole chunk, also where
-the file ends without its index.
+car drove, also what was simulated faster. Channels of a scene (:mod:`bayesrace.scene`) show viewers
+how it looked; they hold no messages. :class:`LogReader` reads every whole chunk, also where the
+file ends without its index.
 """
 
 import json
@@ -38,6 +39,7 @@ from bayesrace.messages import (
     to_json,
     topic_of,
 )
+from bayesrace.scene import SCENE, Drawn, Scene, schema_name, schema_text
 
 __all__ = ["Entry", "LogReader", "LogWriter"]
 
@@ -51,6 +53,7 @@ _DAMAGED: Final = (
 )  # fmt: skip
 """What unpacking raises at a file that is cut off or spoilt."""
 _MCAP_MAGIC: Final = b"\x89MCAP0\r\n"
+_LAYOUT: Final = "foxglove-layout.json"
 
 
 class LogWriter:
@@ -61,8 +64,15 @@ class LogWriter:
     encoding ``msgpack`` and no schema.
     """
 
-    def __init__(self, path: Path, metadata: Mapping[str, Mapping[str, str]] | None = None) -> None:
-        """InputError if the file cannot be written."""
+    def __init__(
+        self,
+        path: Path,
+        metadata: Mapping[str, Mapping[str, str]] | None = None,
+        scene: Scene | None = None,
+    ) -> None:
+        """``scene``: written beside the messages, with a layout as an attachment. InputError if the
+        file cannot be written."""
+        self._scene = scene
         # MCAP tools show calendar time; intervals stay those of the monotonic clock.
         self._epoch_ns = time.time_ns() - time.monotonic_ns()
         self._clock = CarClock()
@@ -81,6 +91,10 @@ class LogWriter:
         self._schemas: dict[str, int] = {}
         for name, values in metadata.items():
             self._writer.add_metadata(name, dict(values))
+        if self._scene is not None:
+            self._scene.begin()
+            layout = _LAYOUT, "application/json", self._scene.layout
+            self._writer.add_attachment(0, time.time_ns(), *layout)
         self.flush()
 
     @property
@@ -103,7 +117,7 @@ class LogWriter:
         place = key, message is None
         if place not in self._channels:
             encoding = "msgpack" if message is None else "json"
-            schema = 0 if message is None else self._schema(type(message))
+            schema = 0 if message is None else self._message_schema(type(message))
             self._channels[place] = self._writer.register_channel(key, encoding, schema)
         wall_ns = self._epoch_ns + received_ns
         time_ns = self._clock.time_ns(message, wall_ns, key.rpartition("/")[0])
@@ -111,13 +125,25 @@ class LogWriter:
         content = data if message is None else to_json(message)
         number = 0 if seq is None else seq & 0xFFFFFFFF
         self._writer.add_message(self._channels[place], time_ns, content, wall_ns, number)
+        if message is not None and self._scene is not None:
+            for drawn in self._scene.of(key, message, time_ns):
+                self._writer.add_message(self._scene_channel(drawn), time_ns, drawn.json, wall_ns)
         return seq
 
-    def _schema(self, kind: type[Message]) -> int:
-        name = kind.__name__
+    def _scene_channel(self, drawn: Drawn) -> int:
+        place = drawn.topic, False
+        if place not in self._channels:
+            kind = type(drawn.message)
+            schema = self._schema(schema_name(kind), lambda: schema_text(kind))
+            self._channels[place] = self._writer.register_channel(drawn.topic, "json", schema)
+        return self._channels[place]
+
+    def _message_schema(self, kind: type[Message]) -> int:
+        return self._schema(kind.__name__, lambda: json.dumps(json_schema(kind)).encode())
+
+    def _schema(self, name: str, text: Callable[[], bytes]) -> int:
         if name not in self._schemas:
-            text = json.dumps(json_schema(kind)).encode()
-            self._schemas[name] = self._writer.register_schema(name, "jsonschema", text)
+            self._schemas[name] = self._writer.register_schema(name, "jsonschema", text())
         return self._schemas[name]
 
     def flush(self) -> None:
@@ -170,6 +196,8 @@ class _Place:
     ended: bool = False
     """The end mark of the part has been read."""
     channels: dict[int, _Channel] = field(default_factory=dict)
+    scene: set[int] = field(default_factory=set)
+    """Numbers of the part's channels that hold no messages, but a scene."""
     refused: int = 0
     """Messages that could not be decoded."""
 
@@ -178,6 +206,14 @@ class _Place:
         self.number, self.repeated = number, repeated
         self.offset = self.unpacked = 0
         self.ended = False
+        self.scene.clear()
+
+    def of_messages(self, record: Any) -> bool:
+        """Whether it is no part of a scene."""
+        if isinstance(record, Channel) and record.topic.startswith(SCENE):
+            self.scene.add(record.id)
+            return False
+        return not (isinstance(record, Record) and record.channel_id in self.scene)
 
 
 class LogReader:
@@ -247,7 +283,9 @@ class LogReader:
         for record in self._records(place):
             if isinstance(record, Channel):
                 topic = topic_of(record.topic)
-                wanted.pop(record.id, None)  # the number of another key in the part before
+                # The number may have been that of another key in the part before.
+                wanted.pop(record.id, None)
+                channels.pop(record.id, None)
                 if topic is None:
                     continue
                 form = decode_json if record.message_encoding == "json" else decode
@@ -322,7 +360,10 @@ class LogReader:
         with file:
             head = file.read(len(_MCAP_MAGIC))
             if not _MCAP_MAGIC.startswith(head):
-                raise InputError(f"{path} is not an MCAP log; give the log of a run")
+                raise InputError(
+                    f"{path} is not an MCAP log; give the log of a run, or make one of a drive of "
+                    "others with 'bayesrace import-drive'"
+                )
             file.seek(place.offset)
             reader = StreamReader(
                 cast(Any, _Whole(file)),
@@ -332,7 +373,8 @@ class LogReader:
             )
             try:
                 for record in reader.records:
-                    place.pending.extend(self._contained(record, place, file))
+                    contained = self._contained(record, place, file)
+                    place.pending.extend(filter(place.of_messages, contained))
                     # Not beyond the footer: the end mark behind it may not be written yet.
                     if not isinstance(record, Footer):
                         place.offset = file.tell()

@@ -11,6 +11,7 @@ from bayesrace.errors import InputError
 from bayesrace.log import LogReader, LogWriter
 from bayesrace.log_parts import PART, part_files, part_path
 from bayesrace.messages import EVENT, decode, topic_of
+from bayesrace.scene import Scene
 
 __all__ = ["RotatingLog"]
 
@@ -35,9 +36,11 @@ class RotatingLog(LogWriter):
         path: Path,
         metadata: Mapping[str, Mapping[str, str]] | None = None,
         most_bytes: int | None = None,
+        scene: Scene | None = None,
     ) -> None:
-        """``most_bytes``: of all parts together; None: no limit, one file. InputError if the log
-        cannot be written, or would replace a file that is no part of a recording."""
+        """``most_bytes``: of all parts together; None: no limit, one file. ``scene``: written
+        beside the messages. InputError if the log cannot be written, or would replace a file that
+        is no part of a recording."""
         for number, file in part_files(path).items():
             if number and LogReader(file).part:
                 file.unlink(missing_ok=True)
@@ -49,7 +52,7 @@ class RotatingLog(LogWriter):
         self._recording, self._number = secrets.token_hex(8), 0
         self._closed: deque[tuple[Path, int]] = deque()
         self._announced: dict[tuple[str, str], tuple[bytes, int]] = {}
-        super().__init__(path, self._described())
+        super().__init__(path, self._described(), scene)
 
     def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
         """Later parts have them, too."""

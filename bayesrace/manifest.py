@@ -7,6 +7,7 @@ or scheme are refused by comparing :attr:`Manifest.discretisation`.
 import hashlib
 import os
 import re
+import sys
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -31,6 +32,7 @@ __all__ = [
     "interface_version",
     "opened_library",
     "read_manifest",
+    "runs_here",
 ]
 
 LIBRARY: Final = "libmpc.so"
@@ -85,6 +87,9 @@ class Manifest(BaseModel):
     horizon: int = Field(gt=0, description="stages N")
     step_s: float = Field(gt=0, description="sampling time Ts")
     gp_capacity: int = Field(gt=0, description="training points per output that fit")
+    path_rows: int = Field(gt=0, description="rows of the line's table that fit")
+    weight_buffers: int = Field(description="3, or 1: weights are set at the start only")
+    estimator: bool = Field(description="states are estimated of what instruments measure")
     casadi: str
     compiler: str
     flags: list[str]
@@ -104,6 +109,11 @@ class Manifest(BaseModel):
                 f"{artefact} was built for car '{self.car}-{self.car_digest}', not "
                 f"'{car.name}-{car.digest()}': run 'bayesrace build'"
             )
+        if car.sensors.root and not self.estimator:
+            raise InputError(
+                f"{artefact} has no estimator, which car '{car.name}' with its sensors needs: run "
+                "'bayesrace build' without --no-estimator"
+            )
 
     def check_points(self, points: int) -> None:
         """InputError if GPs of so many points do not fit into this controller."""
@@ -111,6 +121,14 @@ class Manifest(BaseModel):
             raise InputError(
                 f"--points {points} are more than this controller has room for "
                 f"({self.gp_capacity}); give fewer, or build one with --gp-capacity"
+            )
+
+    def check_rows(self, rows: int) -> None:
+        """InputError if a line's table of so many rows does not fit into this controller."""
+        if rows > self.path_rows:
+            raise InputError(
+                f"a racing line of {rows} rows is longer than this controller has room for "
+                f"({self.path_rows}): build one with --path-rows {rows}"
             )
 
 
@@ -142,6 +160,21 @@ def read_manifest(artefact: Path) -> Manifest:
             f"{interface_version()}: run 'bayesrace build'"
         )
     return manifest
+
+
+def runs_here(artefact: Path) -> bool:
+    """Whether its library is for a processor like this one: its ELF header names the machine that
+    the interpreter's own does."""
+    try:
+        library, interpreter = map(_head, (artefact / LIBRARY, Path(sys.executable)))
+    except OSError:
+        return False
+    return library[:4] == b"\x7fELF" and library[18:] == interpreter[18:]
+
+
+def _head(path: Path) -> bytes:
+    with path.open("rb") as file:
+        return file.read(20)
 
 
 @contextmanager

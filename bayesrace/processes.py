@@ -16,7 +16,7 @@ from typing import Any, Final
 
 __all__ = [
     "RUN_MODULE", "catching_signals", "deferred_interrupt", "die_with_parent",
-    "raise_if_interrupted", "remembering_interrupts",
+    "interrupt", "interrupt_cause", "raise_if_interrupted", "remembering_interrupts",
 ]  # fmt: skip
 
 RUN_MODULE: Final = (sys.executable, "-P", "-m")
@@ -26,6 +26,7 @@ of ours, or of the standard library, is not imported."""
 _PR_SET_PDEATHSIG: Final = 1
 
 _pending = threading.Event()
+_causes: Final[list[Exception]] = []
 
 
 def die_with_parent(pid: int | None) -> None:
@@ -83,6 +84,7 @@ def remembering_interrupts() -> Iterator[None]:
             hook_before(unraisable)
 
     _pending.clear()
+    _causes.clear()
     hook_before, sys.unraisablehook = sys.unraisablehook, on_unraisable
     before = signal.signal(signal.SIGINT, on_signal)
     try:
@@ -94,6 +96,18 @@ def remembering_interrupts() -> Iterator[None]:
         # An interrupt in a string being executed (a dataclass being made) marks the interpreter
         # to end by SIGINT, caught or not; the next string executed takes the mark off again.
         exec("")  # noqa: S102
+
+
+def interrupt(cause: Exception) -> None:
+    """A SIGINT for the main thread, from another one, for that reason."""
+    _causes.append(cause)
+    # Not to the process: another thread would get it, and the main one would sleep on.
+    signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
+
+
+def interrupt_cause() -> Exception | None:
+    """Why the process has interrupted itself; None if it has not, so that a person has."""
+    return _causes[0] if _causes else None
 
 
 def raise_if_interrupted() -> None:

@@ -26,6 +26,7 @@ from bayesrace.messages import (
     encode,
     topic_of,
 )
+from bayesrace.scene import Scene
 
 __all__ = ["FLUSH_PERIOD_S", "Recorder", "RecorderCounters"]
 
@@ -74,9 +75,10 @@ class Recorder:
         path: Path,
         metadata: Mapping[str, Mapping[str, str]] | None = None,
         most_bytes: int | None = None,
+        scene: Scene | None = None,
     ) -> None:
         """``most_bytes``: size of the log at most, of which the newest part is kept; None: no
-        limit."""
+        limit. ``scene``: written beside the messages."""
         self.counters = RecorderCounters()
         self.failed = ""
         """Why the log cannot be written; empty while it can. Later messages are not written."""
@@ -86,7 +88,7 @@ class Recorder:
         self._other_keys: set[str] = set()
         self._path, self._session = path, session
         self._event_key = car_key(EVENT.key, car, "recorder")
-        self._writer = RotatingLog(path, metadata, most_bytes)
+        self._writer = RotatingLog(path, metadata, most_bytes, scene)
         self._lock = threading.Lock()
         self._subscriber = session.declare_subscriber(
             car_key(EVERYTHING, car), zenoh.handlers.FifoChannel(_CHANNEL_CAPACITY)
@@ -116,12 +118,12 @@ class Recorder:
         if self.failed:
             raise InputError(self.failed)
 
-    def close(self) -> None:
+    def close(self, patience_s: float = 2.0) -> None:
         """Wait for stragglers, stop, finish the file; a second call does nothing."""
         if self._stop.is_set():
             return
         try:
-            self.drain()
+            self.drain(at_most_s=patience_s)
         finally:
             self._stop.set()
             self._subscriber.undeclare()

@@ -5,15 +5,19 @@
 A simulated car sends its states at a fixed rate by the monotonic clock, over UDP and over a Unix
 socket of this machine, to ``controller/host`` and to a program that sends each datagram back. The
 times are from before the system call that sends a state to after the one that receives its answer,
-which acts from the next millisecond on.
+which acts from the next millisecond on. Right before it, the car looks for what has come since: its
+own cold caches, after what others computed on its processor, are not the controller's time. The
+process in Python, over Zenoh, is measured by ``bayesrace latency`` in the same run.
 """
 
+import json
 import os
 import socket
 import subprocess
+import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -73,6 +77,14 @@ def started(line: list[str], link: str, folder: Path) -> Iterator[tuple[socket.s
     (folder / "plant").unlink(missing_ok=True)
 
 
+def empty(link: socket.socket) -> None:
+    """Reads what is there."""
+    link.setblocking(False)
+    with suppress(BlockingIOError):
+        while True:
+            link.recv(1 << 16)
+
+
 def driven(link: socket.socket, simulator: br.Simulator, rate_hz: float, seconds: float) -> Any:
     """Times from states to their answers [us]; an answer that is missing counts as a period."""
     period_s, u, after, applied = 1 / rate_hz, np.zeros(2), np.zeros(2), np.zeros(2)
@@ -90,6 +102,7 @@ def driven(link: socket.socket, simulator: br.Simulator, rate_hz: float, seconds
         data, delays, acts = to_datagram(STATE, state), (), steps
         due_s = begin_s + k * period_s
         clock.sleep_until_ns(round(due_s * 1e9))
+        empty(link)
         sent_ns = clock.monotonic_ns()
         link.send(data)
         while (left_s := due_s + 0.5 * period_s - time.monotonic()) > 0:
@@ -132,6 +145,22 @@ def measured(what: str, line: list[str], link: str, folder: Path, simulator: br.
     }  # fmt: skip
 
 
+def python_process(folder: Path, rate: str, seconds: float) -> list[Row]:
+    """The process in Python over Zenoh, beside bare messages over Zenoh."""
+    line = [sys.executable, "-m", "bayesrace.operation.cli", "latency", "--rate", rate, "--out"]
+    run = folder / f"python-{rate}"
+    subprocess.run([*line, str(run), "--duration", f"{seconds:g}"], check=True)
+    found = json.loads((run / "latency.json").read_text())
+    return [
+        {
+            "what": f"{what}, {rate} Hz",
+            **{f"{name}_us": found[key][name] for name in ("p50", "p90", "p99")},
+        }
+        for what, key in (("bare messages, Zenoh", "round_trip_us"),
+                          ("controller in Python, Zenoh", "state_to_actuation_us"))
+    ]  # fmt: skip
+
+
 def main() -> None:
     """Compiles both programs, drives by each in turn, and reports."""
     given = arguments(__doc__, rates=("50", "500"), seconds=20.0)
@@ -157,6 +186,7 @@ def main() -> None:
                 rows.append(
                     measured(what, line, link, folder, simulator, float(rate), given.seconds)
                 )
+            rows += python_process(folder, rate, given.seconds)
     report(given, "state -> actuation of the controller without Python", rows)
 
 

@@ -22,6 +22,7 @@ from bayesrace.operation.closed_loop import ClosedLoop
 from bayesrace.operation.run_plan import RunPlan
 from bayesrace.operation.system import started_system
 from bayesrace.recorder import Recorder
+from bayesrace.scene import Scene
 from bayesrace.tracks import DEFAULT_RACE_TRACK
 from bayesrace.vehicles import default_car
 from benchmarks.harness import (
@@ -47,16 +48,21 @@ def main() -> None:
         stack.enter_context(system.controller(made.arguments))
         logs = folder / "zenoh.mcap", folder / "own.mcap"
 
+        def recorder() -> Recorder:
+            scene = Scene(car, first.track, first.line)
+            return Recorder(system.recording, car.name, logs[0], scene=scene)
+
         def over_zenoh(record: bool) -> float:
             begin_s = time.perf_counter()
             plan = RunPlan(next(runs), "bayesrace", given.laps, 1e3, lockstep=True)
-            with Recorder(system.recording, car.name, logs[0]) if record else nullcontext():
+            with recorder() if record else nullcontext():
                 end = system.drive(first.track, plan)
             return float(end.data["time_s"]) / (time.perf_counter() - begin_s)
 
         def in_one_process(record: bool) -> float:
             begin_s = time.perf_counter()
-            with closing(LogWriter(logs[1])) if record else nullcontext() as log:
+            scene = Scene(car, first.track, first.line)
+            with closing(LogWriter(logs[1], scene=scene)) if record else nullcontext() as log:
                 loop = ClosedLoop(car, first.track, first.line, own, log=log)
                 driven_s = float(loop.drive(given.laps, 1e3).time_s[-1])
             return driven_s / (time.perf_counter() - begin_s)

@@ -1,10 +1,12 @@
-"""What observers that stop reading cost: state to actuation, with and without them.
+"""What observers cost: state to actuation, with and without them.
 
-    python -m benchmarks.observers [--counts 1 5 50] [--seconds 20]
+    python -m benchmarks.observers [--counts 1 5 50] [--pages 5] [--seconds 20]
 
 A learned car drives in real time over tcp. So many observers hear everything, then they are stopped
 (SIGSTOP), as by Ctrl-Z; what is measured begins with that and lasts longer than the lease of their
-links. Before each there is a stretch without any, with which it is compared.
+links. Or so many pages are open at 'bayesrace view --live'; who takes their messages does nothing
+with them, as a browser on another machine. Before each there is a stretch without any, with which
+it is compared.
 """
 
 import os
@@ -13,7 +15,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -49,6 +51,33 @@ def stopped(count: int, where: tuple[str, ...]) -> Iterator[None]:
             process.kill()
 
 
+_PAGES = """
+import sys, threading
+from websockets.sync.client import connect
+def look():
+    for message in connect(sys.argv[2].replace("http", "ws") + "updates", max_size=None): pass
+for _ in range(int(sys.argv[1])): threading.Thread(target=look).start()
+"""
+
+
+@contextmanager
+def viewed(count: int, where: tuple[str, ...]) -> Iterator[None]:
+    """That many pages of a live view; none for 0."""
+    if not count:
+        yield
+        return
+    view = [sys.executable, "-m", "bayesrace.operation.cli", "view", "--live", "--port", "0"]
+    view += [word for one in where for word in ("--endpoint", one)]
+    with TemporaryDirectory() as empty, ExitStack() as stack:
+        serving = stack.enter_context(subprocess.Popen(view, stdout=subprocess.PIPE, cwd=empty))
+        stack.callback(serving.kill)
+        address = serving.stdout.readline().decode().split()[0] if serving.stdout else ""
+        pages = [sys.executable, "-c", _PAGES, str(count), address]
+        stack.callback(stack.enter_context(subprocess.Popen(pages)).kill)
+        time.sleep(5)  # until the viewer has found the car, and the pages show it
+        yield
+
+
 def stretch(system: System, file: Path, seconds: float) -> tuple[Floats, int]:
     """Times from a state to its actuation's arrival [ms], and the longest gap in periods."""
     with Recorder(system.session, DEFAULT_CAR, file):
@@ -62,7 +91,8 @@ def stretch(system: System, file: Path, seconds: float) -> tuple[Floats, int]:
 
 def main() -> None:
     """Drives without end, with more and more observers."""
-    given, rows = arguments(__doc__, counts=("1", "5", "50"), seconds=20.0), list[Row]()
+    rows: list[Row]
+    given, rows = arguments(__doc__, counts=("1", "5", "50"), pages=("5",), seconds=20.0), []
     made, where = prepared(DEFAULT_RACE_TRACK), (free_endpoint(), free_endpoint())
     with (
         TemporaryDirectory() as name,
@@ -73,13 +103,17 @@ def main() -> None:
     ):
         plan = RunPlan(1, "", 0, 1e5, lockstep=False)
         system.director.start(run_request(made.first.track, plan))
-        for number, count in enumerate(one for word in given.counts for one in (0, int(word))):
-            with stopped(count, where):
-                times_ms, gap = stretch(system, folder / f"{number}.mcap", given.seconds)
-            row = {"observers": count, **percentiles(times_ms), "longest gap, periods": gap}
-            rows.append(row)
+        tried = [(stopped, int(word)) for word in given.counts]
+        tried += [(viewed, int(word)) for word in given.pages]
+        for number, (kind, most) in enumerate(tried):
+            for count in (0, most):
+                with kind(count, where):
+                    log = folder / f"{number}-{count}.mcap"
+                    times_ms, gap = stretch(system, log, given.seconds)
+                row = {"observers": f"{count} {'pages' if kind is viewed else 'stopped'}"}
+                rows.append({**row, **percentiles(times_ms), "longest gap, periods": gap})
         system.director.stop("measured")
-    report(given, "state to actuation [ms], observers stopped", rows)
+    report(given, "state to actuation [ms], with observers", rows)
 
 
 if __name__ == "__main__":

@@ -25,6 +25,7 @@ from bayesrace.codegen.platforms import Platform, host_platform
 from bayesrace.codegen.settings import BuildSettings
 from bayesrace.errors import InputError
 from bayesrace.files import read_whole
+from bayesrace.integrators import PERFECT, PREDICTION
 from bayesrace.manifest import (
     DECLARATIONS,
     LIBRARY,
@@ -35,9 +36,10 @@ from bayesrace.manifest import (
     interface_version,
     opened_library,
     read_manifest,
+    runs_here,
 )
 from bayesrace.trusted_files import trusted
-from bayesrace.vehicles import get_car
+from bayesrace.vehicles import Car, get_car
 
 if TYPE_CHECKING:
     from bayesrace.codegen.problems.problem import Problem
@@ -46,16 +48,23 @@ __all__ = [
     "HOST",
     "NATIVE",
     "PROGRAM",
+    "archives_of",
     "artefact_compiler",
     "build",
     "build_hash",
+    "casadi_includes",
+    "checking_artefact",
     "generate",
     "host_program",
     "problem_of",
+    "write_sizes",
 ]
 
 NATIVE: Final = Path(__file__).parents[1] / "controller" / "native"
 """The hand-written part of the step: read as files, not imported."""
+
+DAQP_ARCHIVE: Final = "libdaqpstat.a"
+"""DAQP of CasADi's wheel, in an artefact without DAQP's C."""
 
 HOST: Final = "host"
 """Folder of the C that is for hosts, and no part of the library."""
@@ -124,7 +133,7 @@ def generate(problem: "Problem", settings: BuildSettings, folder: Path) -> None:
     """Writes br_model.c, br_model.h, br_config.h and br_problem.h into a folder."""
     import casadi as ca
 
-    from bayesrace.codegen.problems.generate import c_header, functions
+    from bayesrace.codegen.problems.generate import functions
 
     # CasADi derives the include guard from the name and writes into the working folder
     generator = ca.CodeGenerator(
@@ -133,6 +142,13 @@ def generate(problem: "Problem", settings: BuildSettings, folder: Path) -> None:
     for function in functions(problem):
         generator.add(function)
     generator.generate(str(folder) + os.sep)
+    write_sizes(problem, settings, folder)
+
+
+def write_sizes(problem: "Problem", settings: BuildSettings, folder: Path) -> None:
+    """Writes br_config.h and br_problem.h alone, by which the memory of a controller is known."""
+    from bayesrace.codegen.problems.generate import c_header
+
     (folder / "br_problem.h").write_text(c_header(problem))
     free, block = settings.blocks
     (folder / "br_config.h").write_text(
@@ -143,6 +159,9 @@ def generate(problem: "Problem", settings: BuildSettings, folder: Path) -> None:
         f"#define BR_BLOCK {block}\n"
         f"#define BR_TS {settings.discretisation.step_s!r}\n"
         f"#define BR_GP_CAPACITY {settings.gp_capacity}\n"
+        f"#define BR_PATH_CAPACITY {settings.path_rows}\n"
+        f"#define BR_WEIGHT_BUFFERS {settings.weight_buffers}\n"
+        f"#define BR_HAS_ESTIMATOR {settings.estimator:d}\n"
         f"#define BR_ABI {interface_version()}\n"
         f'#define BR_MODEL_IDENTITY "{_model_identity(settings)}"\n'
         "#endif\n"
@@ -159,7 +178,7 @@ def casadi_includes() -> tuple[Path, Path]:
     import casadi as ca
 
     package = Path(ca.__file__).parent
-    return package / "include", package / "libdaqpstat.a"
+    return package / "include", package / DAQP_ARCHIVE
 
 
 def _compile(
@@ -208,6 +227,12 @@ def _library(compiler: Compiler, folder: Path) -> bytes:
     return _compiled("library", compiler.shared_library, compiler, folder)
 
 
+def archives_of(artefact: Path) -> list[Path]:
+    """What is linked with an artefact's C on this machine; none where DAQP's C is part of it."""
+    archive = artefact / DAQP_ARCHIVE
+    return [archive] if archive.exists() else []
+
+
 def host_program(artefact: Path, compiler: Compiler) -> bytes:
     """The executable of ``controller/host`` with the artefact's controller linked in."""
     return _compiled("host", compiler.program, compiler, artefact, artefact / HOST)
@@ -219,7 +244,7 @@ def _compiled(
 ) -> bytes:  # fmt: skip
     """What ``link`` makes of the sources of an artefact's folder and of others; from the cache if
     it is there."""
-    archives, folders = sorted(folder.glob("*.a")), [folder, *more]
+    archives, folders = archives_of(folder), [folder, *more]
     sources = sorted(one for each in (*folders, folder / "daqp") for one in each.glob("*.c"))
     files = sorted((*folder.rglob("*.[ch]"), *archives))
     named = (part for file in files for part in (file.name, file.read_bytes()))
@@ -251,17 +276,19 @@ def build(
     problem: "Problem | None" = None,
     platform: Platform | None = None,
     daqp: Path | None = None,
+    compiler: Compiler | None = None,
 ) -> tuple[Path, Manifest]:
     """Artefact folder and manifest of the controller; from the cache if it is there.
 
     ``problem``: one of your own, with the step of ``settings.discretisation``; that of the
     settings without. ``platform``: what it is to run on (None: this machine), by the compiler that
     ``CC`` names or else by ziglang. ``daqp``: DAQP's source distribution in place of the static
-    library that CasADi's wheel has, which is for this machine alone.
+    library that CasADi's wheel has, which is for this machine alone. ``compiler``: in place of
+    these.
     Raises CompileError with the compiler's own words, InputError if there is no compiler.
     """
     cache = code_folder()
-    compiler = artefact_compiler(platform, daqp)
+    compiler = compiler or artefact_compiler(platform, daqp)
     identity = build_hash(settings, compiler, problem, daqp)
     name = problem.name if problem else f"{settings.problem}-{settings.model}"
     target = cache / f"{name}-{identity}"
@@ -299,6 +326,30 @@ def build(
             folder.rename(target)
     note_use(made=True)
     return target, manifest
+
+
+def checking_artefact(artefact: Path, car: Car) -> Path:
+    """A controller of this machine to check weights by: itself, or where it is for another platform
+    one that predicts alike.
+
+    InputError where it is of another release or car.
+    """
+    wanted = read_manifest(artefact)
+    wanted.check_car(car, artefact)
+    if runs_here(artefact):
+        return artefact
+    discretisation = PERFECT if wanted.model == "dynamic" else PREDICTION
+    settings = BuildSettings.model_validate(
+        {
+            "car": car, "model": wanted.model, "problem": wanted.problem.name,
+            "discretisation": discretisation, "horizon": wanted.horizon,
+            "gp_capacity": wanted.gp_capacity,
+        }
+    )  # fmt: skip
+    folder, made = build(settings, compiler=find_compiler(by_name=True))
+    if made.discretisation != wanted.discretisation:
+        raise InputError(f"{artefact} predicts otherwise than what is built now: build it again")
+    return folder
 
 
 def artefact_compiler(platform: Platform | None, daqp: Path | None) -> Compiler:
@@ -357,6 +408,9 @@ def _manifest(
         horizon=settings.stages,
         step_s=settings.discretisation.step_s,
         gp_capacity=settings.gp_capacity,
+        path_rows=settings.path_rows,
+        weight_buffers=settings.weight_buffers,
+        estimator=settings.estimator,
         casadi=version("casadi"),
         compiler=compiler.version,
         flags=list(FLAGS),

@@ -26,7 +26,9 @@ from bayesrace.trusted_files import make_folder, trusted
 if TYPE_CHECKING:
     import casadi as ca
 
-__all__ = ["FLAGS", "CompileError", "Compiler", "find_compiler", "compiled"]
+__all__ = [
+    "FLAGS", "CompileError", "Compiler", "chosen_command", "compiled", "find_compiler", "version_of"
+]  # fmt: skip
 
 FLAGS: Final = (
     "-std=gnu11",
@@ -84,31 +86,39 @@ class Compiler:
     ) -> None:
         """Compiles ``sources`` and links them with ``archives``."""
         with temporary_folder() as folder:
-            self._link(sources, includes, archives, out, FLAGS, [], folder)
+            self._link(sources, includes, archives, out, FLAGS, ["-pthread"], folder)
 
     def _link(
         self, sources: list[Path], includes: list[Path], archives: list[Path], out: Path,
         flags: tuple[str, ...], how: list[str | Path], folder: Path,
     ) -> None:  # fmt: skip
-        """As many files at once as there are processors, in an empty folder."""
+        objects = self.objects(sources, includes, flags, folder)
+        self.run(*flags, *how, *objects, *archives, "-lm", "-o", out)
+
+    def objects(
+        self, sources: list[Path], includes: list[Path], flags: tuple[str, ...], folder: Path
+    ) -> list[Path]:
+        """Compiled, as many at once as there are processors, into an empty folder."""
         seen = [f"-I{path}" for path in includes]
-        objects = [folder / f"{i}.o" for i in range(len(sources))]
+        objects = [folder / f"{source.stem}-{i}.o" for i, source in enumerate(sources)]
 
         def compile_one(source: Path, target: Path) -> None:
             self.run(*flags, *seen, "-c", source, "-o", target)
 
         with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
             list(pool.map(compile_one, sources, objects))  # after a failure no other is begun
-        self.run(*flags, *how, *objects, *archives, "-lm", "-o", out)
+        return objects
 
-    def run(self, *arguments: str | Path, folder: Path | None = None) -> None:
-        """Runs it in a folder, the current one by default; CompileError with what it printed."""
+    def run(self, *arguments: str | Path, folder: Path | None = None) -> str:
+        """Runs it in a folder, the current one by default; its output. CompileError with what it
+        printed of an error."""
         line = [*self.command, *(str(one) for one in arguments)]
         done = subprocess.run(
             line, cwd=folder, capture_output=True, text=True, errors="replace", check=False
         )
         if done.returncode:
             raise CompileError(f"{shlex.join(line)}\n{_shortened(done.stderr)}")
+        return done.stdout
 
 
 def _shortened(text: str, most: int = 4000) -> str:
@@ -118,13 +128,18 @@ def _shortened(text: str, most: int = 4000) -> str:
     return f"{text[: most // 2]}\n[…]\n{text[-most // 2 :]}"
 
 
-def _candidates() -> list[tuple[str, ...]]:
-    chosen = os.environ.get("CC")
-    if chosen:
-        try:
-            return [tuple(shlex.split(chosen))]
-        except ValueError as error:
-            raise InputError(f"CC={chosen}: {error}; set it to a command such as 'gcc'") from None
+def chosen_command() -> tuple[str, ...]:
+    """What ``CC`` names; empty if it names nothing. InputError if that is no command."""
+    chosen = os.environ.get("CC", "")
+    try:
+        return tuple(shlex.split(chosen))
+    except ValueError as error:
+        raise InputError(f"CC={chosen}: {error}; set it to a command such as 'gcc'") from None
+
+
+def _candidates(by_name: bool) -> list[tuple[str, ...]]:
+    if not by_name and (chosen := chosen_command()):
+        return [chosen]
     found: list[tuple[str, ...]] = [
         (name,) for name in ("cc", "gcc", "clang") if shutil.which(name)
     ]
@@ -158,17 +173,22 @@ def _run(line: list[str]) -> str:
     return done.stdout
 
 
+def version_of(command: tuple[str, ...]) -> str:
+    """What a compiler says of itself."""
+    return (_run([*command, "--version"]).splitlines() or ["unknown version"])[0]
+
+
 @cache
-def find_compiler() -> Compiler:
+def find_compiler(by_name: bool = False) -> Compiler:
     """$CC, the system's cc, gcc or clang, or ziglang: the first that can build a library.
 
-    InputError with the remedy if none can.
+    ``by_name``: whatever ``CC`` says, which may be for another machine. InputError with the remedy
+    if none can.
     """
     tried = []
-    for command in _candidates():
+    for command in _candidates(by_name):
         try:
-            version = _run([*command, "--version"]).splitlines() or ["unknown version"]
-            compiler = Compiler(command, version[0])
+            compiler = Compiler(command, version_of(command))
             _can_build(compiler)
         except (OSError, subprocess.SubprocessError) as error:
             words = getattr(error, "stderr", "") or str(error)

@@ -24,6 +24,7 @@ __all__ = [
     "SETTINGS_FILE",
     "WEIGHTS_FILE",
     "export",
+    "packed_weights_file",
     "path_file",
     "settings_file",
     "weights_file",
@@ -36,8 +37,7 @@ SETTINGS_FILE: Final = "settings.txt"
 PATH_COLUMNS: Final = 7
 """BR_PATH_COLUMNS in controller/native/bayesrace_mpc.h."""
 
-PATH_CAPACITY: Final = 8192
-"""BR_PATH_CAPACITY there."""
+_LEAST_ROWS: Final = 8
 
 _SCHEMA: Final = 3
 HEAD: Final = struct.Struct("<8sIIQQ")
@@ -56,13 +56,17 @@ def _file(magic: bytes, body: bytes, room: int = 0) -> bytes:
     return HEAD.pack(magic, _SCHEMA, len(body), _fnv1a(body), room) + body
 
 
-def path_file(rows: ArrayLike, spacing_m: float) -> bytes:
-    """The file of a racing line: rows (n, 7) of ``br_mpc_set_path``, every ``spacing_m``."""
+def path_file(rows: ArrayLike, spacing_m: float, manifest: Manifest) -> bytes:
+    """The file of a racing line: rows (n, 7) of ``br_mpc_set_path``, every ``spacing_m``.
+
+    InputError if they do not fit into the controller of ``manifest``.
+    """
     table = np.ascontiguousarray(rows, dtype="<f8")
-    if table.ndim != 2 or table.shape[1] != PATH_COLUMNS or not 8 <= len(table) <= PATH_CAPACITY:
+    if table.ndim != 2 or table.shape[1] != PATH_COLUMNS or len(table) < _LEAST_ROWS:
         raise InputError(
-            f"path table has shape {table.shape}, not (8 to {PATH_CAPACITY}, {PATH_COLUMNS})"
+            f"path table has shape {table.shape}, not ({_LEAST_ROWS} or more, {PATH_COLUMNS})"
         )
+    manifest.check_rows(len(table))
     if not np.isfinite(table).all():
         raise InputError("path table holds a number that is not finite")
     return _file(b"BRFMPATH", struct.pack("<d", spacing_m) + table.tobytes())
@@ -74,15 +78,23 @@ def weights_file(weights: Weights | None, identity: str, capacity: int) -> bytes
     ``identity``: of the discretised model that the controller predicts with, ``capacity``: training
     points that it has room for. InputError for weights of another model or with more.
     """
-    none = weights is None
     if weights is None:
-        weights = zero_weights("none", identity)
-    weights.check_fit(identity, capacity)
-    words = [(identity, IDENTITY_BYTES), ("" if none else weights.version, _VERSION_BYTES)]
+        packed, version = pack_weights(zero_weights("none", identity)), ""
+    else:
+        weights.check_fit(identity, capacity)
+        packed, version = pack_weights(weights), weights.version
+    return packed_weights_file(packed, version, identity, capacity)
+
+
+def packed_weights_file(packed: bytes, version: str, identity: str, capacity: int) -> bytes:
+    """The same of what :func:`.pack_weights` makes; empty: no correction."""
+    if not packed:
+        return weights_file(None, identity, capacity)
+    words = [(identity, IDENTITY_BYTES), (version, _VERSION_BYTES)]
     if any(len(word.encode()) >= room for word, room in words):
         raise InputError(f"identity or version of weights is too long for their file: {words}")
     head = b"".join(word.encode().ljust(room, b"\0") for word, room in words)
-    return _file(b"BRFMGPWT", head + pack_weights(weights), capacity)
+    return _file(b"BRFMGPWT", head + packed, capacity)
 
 
 def settings_file(values: Mapping[str, float | tuple[float, ...]]) -> str:
@@ -103,6 +115,6 @@ def export(
     """Writes all three files for a built controller; arguments as of the functions above."""
     folder.mkdir(parents=True, exist_ok=True)
     learned = weights_file(weights, manifest.discretisation, manifest.gp_capacity)
-    write_whole(folder / PATH_FILE, path_file(rows, spacing_m))
+    write_whole(folder / PATH_FILE, path_file(rows, spacing_m, manifest))
     write_whole(folder / WEIGHTS_FILE, learned)
     write_whole(folder / SETTINGS_FILE, settings_file(values))

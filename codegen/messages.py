@@ -16,6 +16,9 @@ from bayesrace.messages import (
     QUANTITIES,
     STATE,
     TELEMETRY,
+    UPDATE,
+    UPDATED,
+    LinkTopic,
     Reading,
     Service,
     Topic,
@@ -25,8 +28,8 @@ from bayesrace.messages import (
 
 __all__ = ["TOPICS_IN_C", "messages_header"]
 
-TOPICS_IN_C: Final[tuple[Topic[Any] | Service[Any, Any], ...]] = (
-    STATE, COMMAND, ACTUATION, BRAKING, TELEMETRY,
+TOPICS_IN_C: Final[tuple[Topic[Any] | Service[Any, Any] | LinkTopic, ...]] = (
+    STATE, COMMAND, UPDATE, ACTUATION, BRAKING, TELEMETRY, UPDATED,
 )  # fmt: skip
 """What a controller in C receives and sends."""
 
@@ -134,6 +137,9 @@ def _field(name: str, of: Any) -> _Field:
         words = _words(of.pattern) if of.pattern else []
         most = of.max_length or max(map(len, words))
         return _Field([f"char {name}[{4 * most + 1}]"], "TEXT", 0, most, words=words)
+    if isinstance(of, inspect.BytesType):
+        members = [f"int {name}_count", f"uint8_t {name}[{of.max_length}]"]
+        return _Field(members, "BYTES", 0, of.max_length or 0)
     if isinstance(of, inspect.DictType):
         pair = cast(inspect.TupleType, of.value_type)
         value = _plain(pair.item_types[0])

@@ -2,9 +2,9 @@
 
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, field_validator
 
-from bayesrace.defaults import MAX_POINTS
+from bayesrace.defaults import MAX_POINTS, PATH_ROWS
 from bayesrace.integrators import PERFECT, PREDICTION, Discretisation
 from bayesrace.vehicles import DEFAULT_CAR, Car, CarSetting, default_car, get_car
 
@@ -46,6 +46,24 @@ class BuildSettings(BaseModel):
         "without",
     )
     gp_capacity: int = Field(1024, ge=8, le=MAX_POINTS, description="most points per output")
+    path_rows: int = Field(PATH_ROWS, ge=8, le=65536, description="most rows of the line's table")
+    weight_buffers: int = Field(
+        3,
+        ge=1,
+        le=3,
+        description="3: new weights while driving, and back to those before; 1: at the start only, "
+        "in a third of the memory",
+    )
+    estimator: bool = Field(
+        True, description="estimate states: they come as a whole, and the estimator is left out"
+    )
+
+    @field_validator("weight_buffers")
+    @classmethod
+    def _one_or_three(cls, count: int) -> int:
+        if count == 2:
+            raise ValueError("1 or 3: in use, proven, and spare, or one for all")
+        return count
 
     @property
     def stages(self) -> int:

@@ -14,9 +14,10 @@ from bayesrace.arrays import Floats
 from bayesrace.controller.interface import StepOutput
 from bayesrace.controller.native_step import Artefact, NativeStep, Status
 from bayesrace.controller.settings import GateSettings, MpcSettings
-from bayesrace.controller.weights.adoption import WeightsPort
+from bayesrace.controller.weights.adoption import StepPort
 from bayesrace.controller.weights.checks import Checks
 from bayesrace.controller.weights.store import AcceptedWeights, History, Store, digest_of
+from bayesrace.defaults import PATH_ROWS
 from bayesrace.errors import InputError, faults_in
 from bayesrace.files import read_whole
 from bayesrace.gp.weights import (
@@ -26,6 +27,7 @@ from bayesrace.gp.weights import (
     pack_weights,
     read_weights,
 )
+from bayesrace.manifest import Manifest
 from bayesrace.messages import NOT_REPORTED
 from bayesrace.raceline import RaceLine, read_raceline_for
 from bayesrace.tracks import Track, load_track
@@ -33,15 +35,12 @@ from bayesrace.tracks.spline import PlaneSpline
 from bayesrace.vehicles import Car
 
 __all__ = [
-    "CAPACITY", "PathTable", "PredictiveController", "compiled_controller", "make_path_table",
-    "predictive_controller", "read_checked", "read_settings",
+    "PathTable", "PredictiveController", "compiled_controller", "make_path_table",
+    "opened_history", "path_table_for", "predictive_controller", "read_checked", "read_settings",
 ]  # fmt: skip
 
 Settings = TypeVar("Settings", bound=BaseModel)
 
-
-CAPACITY: Final = 8192
-"""BR_PATH_CAPACITY in controller/native/bayesrace_mpc.h."""
 
 ASTRAY_MAX: Final = 0.05
 """Share of a line that may be farther out than half the track's width: with more it belongs to
@@ -67,14 +66,17 @@ class PathTable:
     spacing_m: float
 
 
-def make_path_table(track: Track, line: RaceLine, spacing_m: float) -> PathTable:
+def make_path_table(
+    track: Track, line: RaceLine, spacing_m: float, most_rows: int = PATH_ROWS
+) -> PathTable:
     """Samples the line and, at each sample's projection on the centreline, the two half-planes.
 
     The half-planes are parallel to the centreline (paper, equation 8d), their normal has length 1,
     their distance is the track's width there. ``spacing_m``: wanted distance of rows; between them
-    the planner interpolates linearly. InputError if the line belongs to another track.
+    the planner interpolates linearly; larger where there would be more than ``most_rows``.
+    InputError if the line belongs to another track.
     """
-    count = min(CAPACITY, max(8, math.ceil(line.length_m / spacing_m)))
+    count = min(most_rows, max(8, math.ceil(line.length_m / spacing_m)))
     s: Floats = np.arange(count, dtype=np.float64) * (line.length_m / count)
     nodes = np.append(line.s_m, line.s_m[0] + line.length_m)
     xy = PlaneSpline(line.s_m, line.xy_m, line.length_m)(s)
@@ -93,13 +95,23 @@ def make_path_table(track: Track, line: RaceLine, spacing_m: float) -> PathTable
     return PathTable(np.ascontiguousarray(rows), line.length_m / count)
 
 
+def path_table_for(manifest: Manifest, car: Car, track: Track, line: RaceLine) -> PathTable:
+    """The table that a built controller has room for; InputError if its rows would be too far
+    apart."""
+    tuning = car.tuning.path
+    table = make_path_table(track, line, tuning.spacing_m, manifest.path_rows)
+    if table.spacing_m > tuning.spacing_max_m:
+        manifest.check_rows(math.ceil(line.length_m / tuning.spacing_max_m))
+    return table
+
+
 class PredictiveController:
     """See :class:`.Controller`; BestCase, WorstCase and BayesRace alike."""
 
     def __init__(
         self,
         step: NativeStep,
-        port: WeightsPort | None = None,
+        port: StepPort | None = None,
         track: str = "",
     ) -> None:
         """``step``: with parameters and path set. ``port``: how a process takes over new weights;
@@ -189,7 +201,7 @@ def compiled_controller(
     Raises InputError if artefact, car, line or weights do not fit together.
     """
     step = NativeStep(artefact, car, settings or MpcSettings(), parameters)
-    step.set_path(table or make_path_table(track, line, car.tuning.path.spacing_m))
+    step.set_path(table or path_table_for(step.manifest, car, track, line))
     if weights is not None:
         step.set_weights(read_weights(weights) if isinstance(weights, Path) else weights)
     return PredictiveController(step, track=track.identity)
@@ -206,6 +218,20 @@ def read_checked(path: Path, artefact: Path, car: Car, gate: GateSettings | None
     return weights
 
 
+def opened_history(
+    loaded: Weights | None, store: Path | None, discretisation: str
+) -> tuple[History, Store | None]:
+    """Weights that a controller accepts, after those that are loaded at its start; and the folder
+    that keeps them. InputError if that cannot be used."""
+    data, packed = (b"", b"") if loaded is None else (encode_weights(loaded), pack_weights(loaded))
+    first = AcceptedWeights(
+        number=0, version=loaded.version if loaded else "", digest=digest_of(data), proven=True,
+        data=data, packed=packed,
+    )  # fmt: skip
+    folder = None if store is None else Store(store, discretisation)
+    return History(entries=[first]) if folder is None else folder.restore(first), folder
+
+
 def predictive_controller(
     artefact: Path,
     car: Car,
@@ -220,25 +246,28 @@ def predictive_controller(
 
     ``store``: folder of the weights that it accepts; the newest that an earlier controller kept
     there are in use from the start, in place of ``weights``. ``gate``: thresholds that ``weights``
-    must pass; those in the store have passed them. InputError names the file that cannot be used.
+    must pass; those in the store have passed them. Where it has one buffer of weights it takes none
+    while driving, and has no store. InputError names the file that cannot be used.
     """
     loaded = None if weights is None else read_checked(weights, artefact, car, gate)
     driven_on = load_track(track, car.width_m)
     line = read_raceline_for(raceline, driven_on, car)
     mpc = read_settings(settings, MpcSettings)
-    step = compiled_controller(artefact, car, driven_on, line, loaded, mpc).native
-    data, packed = (b"", b"") if loaded is None else (encode_weights(loaded), pack_weights(loaded))
-    first = AcceptedWeights(
-        number=0, version=step.weights_version, digest=digest_of(data), proven=True, data=data,
-        packed=packed,
-    )  # fmt: skip
-    folder = None if store is None else Store(store, step.manifest.discretisation)
-    history = History(entries=[first]) if folder is None else folder.restore(first)
+    controller = compiled_controller(artefact, car, driven_on, line, loaded, mpc)
+    step = controller.native
+    if step.manifest.weight_buffers == 1:
+        if store is not None:
+            raise InputError(
+                f"{artefact} has one weight buffer: it takes no weights to keep in {store}; give "
+                "no store, or build one with --weight-buffers 3"
+            )
+        return controller
+    history, folder = opened_history(loaded, store, step.manifest.discretisation)
     in_use, proven = history.in_use, history.reference
-    if proven is not first:
+    if proven is not history.entries[0]:
         step.set_weights(decode_weights(proven.data))
     if in_use is not proven:  # a controller has ended while it watched them
         step.stage_weights(in_use.packed)
         step.adopt_weights(in_use.version)
-    port = WeightsPort(artefact.resolve(), step, car, history, folder)
+    port = StepPort(artefact.resolve(), car, history, folder, step)
     return PredictiveController(step, port, driven_on.identity)

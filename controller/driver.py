@@ -245,8 +245,11 @@ class Driver:
         return self._refused if self._library.br_cycle_forget(self._cycle) else None
 
     def estimate(self, settings: Mapping[str, Any]) -> None:
-        """How states are estimated: a br_estimation by name. InputError for bad numbers."""
+        """How states are estimated: a br_estimation by name. InputError for bad numbers. Nothing
+        for a controller without estimator."""
         artefact, nominal = self.controller.artefact, self.controller.nominal
+        if not artefact.manifest.estimator:
+            return
         error = self._library.br_cycle_set_estimation(
             self._cycle,
             artefact.ffi.NULL if nominal is None else nominal.handle,

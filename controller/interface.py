@@ -11,7 +11,7 @@ from bayesrace.arrays import Floats
 
 if TYPE_CHECKING:
     from bayesrace.controller.native_step import Artefact, NativeProblem
-    from bayesrace.controller.weights.adoption import WeightsPort
+    from bayesrace.controller.weights.adoption import StepPort
 
 __all__ = ["NO_LIMITS", "NO_PLAN", "ControlLaw", "Controller", "Environment", "StepOutput"]
 
@@ -93,7 +93,7 @@ class Controller(Protocol):
         of the step, with its correction and its variance."""
 
     @property
-    def port(self) -> "WeightsPort | None":
+    def port(self) -> "StepPort | None":
         """Where a process stages weights that are checked; None: it takes no weights."""
 
 

@@ -153,15 +153,13 @@ class NativeProblem:
         self.plan_x, self._plan_x = self._made(n + 1, nx)
         self.plan_u, self._plan_u = self._made(n, nu)
         self.tube, self._tube = self._made(n)
-        self._watch = ffi.new("br_mpc_watch *")
         # Functions of PyDLL hold on to the interpreter's lock, which takes longer to get back than
         # they run; those of cffi release it.
         self._quick = ctypes.PyDLL(str(self.artefact.path))
-        self._address, self._watch_address = (
-            ctypes.c_void_p(int(ffi.cast("uintptr_t", one))) for one in (self.handle, self._watch)
-        )
+        self._address = self._pointer(self.handle)
         clock = ffi.addressof(self._library, "br_mpc_monotonic")
         self._check(self._library.br_mpc_set_clock(self.handle, clock, ffi.NULL), "clock")
+        self._rows = 0
         self.weights_version = self._proven_version = ""
         """Of the weights in use; empty while there is no correction."""
         self.load_weights(b"")
@@ -283,12 +281,25 @@ class NativeProblem:
         self._check(self._quick.br_mpc_revert_weights(self._address), "weights")
         self.weights_version = self._proven_version
 
-    def watch(self, resolution: Floats) -> Any:
-        """How the weights in use do beside the proven ones, a br_mpc_watch; overwritten by the
-        next. ``resolution`` (ne,), contiguous: errors per stage that do not count."""
-        given = ctypes.c_void_p(resolution.ctypes.data)
-        self._quick.br_mpc_get_watch(self._address, given, self._watch_address)
-        return self._watch
+    def new_trial(self, probation: Mapping[str, Any]) -> Any:
+        """A br_mpc_trial of weights that have just been adopted; ``probation``: a br_mpc_probation
+        by name."""
+        trial = self._ffi.new("br_mpc_trial *")
+        self._probation = self._ffi.new("br_mpc_probation *", dict(probation))
+        return trial
+
+    def observe_trial(self, trial: Any, vx_mps: float, fallen_back: bool | None) -> None:
+        """A state, and whether the fallback drove the cycle before; None: the car was not."""
+        fell = ctypes.c_int(-1 if fallen_back is None else fallen_back)
+        self._quick.br_mpc_observe_trial(self._pointer(trial), ctypes.c_double(vx_mps), fell)
+
+    def judge_trial(self, trial: Any) -> int:
+        """What is to be done about the weights on trial, between two steps: a br_mpc_ruling."""
+        given = self._pointer(self._probation), self._pointer(trial)
+        return int(self._quick.br_mpc_judge_trial(self._address, *given))
+
+    def _pointer(self, to: Any) -> ctypes.c_void_p:
+        return ctypes.c_void_p(int(self._ffi.cast("uintptr_t", to)))
 
     def samples(self) -> tuple[Floats, Floats, Floats]:
         """The newest samples of what the car has done, by the thread that steps: features (n, nz),
@@ -495,24 +506,26 @@ class NativeStep(NativeProblem):
         self.set_values(settings.parameters(car, self.manifest.problem.name))
 
     def set_path(self, table: "PathTable") -> None:
-        """Racing line and track; copied."""
-        rows = self._given("path table", table.rows, len(table.rows), PATH_COLUMNS)
-        count = len(table.rows)
+        """Racing line and track; copied. InputError if it has more rows than fit."""
+        self.manifest.check_rows(count := len(table.rows))
+        rows = self._given("path table", table.rows, count, PATH_COLUMNS)
         error = self._library.br_mpc_set_path(self.handle, rows, count, table.spacing_m)
         self._check(error, "path")
-        self._line_mps, self._spacing_m = table.rows[:, 2].copy(), table.spacing_m
+        self._rows = count
 
     def speeds(self) -> Floats:
         """The line's speeds at the path's rows (n,), as far as the weights in use know the car. The
         thread that stages weights may ask, too."""
-        made, given = self._made(count := len(self._line_mps))
+        made, given = self._made(count := self._rows)
         self._check(self._library.br_mpc_get_speeds(self.handle, given, count), "speeds")
         return made
 
     @property
     def unknown_s(self) -> float:
         """What a lap loses to the line because the weights in use do not know the car there."""
-        return self._spacing_m * float((1 / self.speeds() - 1 / self._line_mps).sum())
+        lost_s = self._ffi.new("double *")
+        self._check(self._library.br_mpc_get_loss(self.handle, lost_s), "speeds")
+        return float(lost_s[0])
 
     def set_weights(self, weights: Weights) -> None:
         """Uses the weights from the next step on; InputError if they are for another model."""

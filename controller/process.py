@@ -110,10 +110,11 @@ class ControllerProcess:
         self._weights: WeightUpdateManager | None = None
         self._adoption: Adoption | None = None
         if controller.port is not None:
-            self._weights = WeightUpdateManager(
-                session, self.name, controller.port, settings.gate, self._service.announce
-            )
-            self._service.weights, self._adoption = self._weights, self._weights.adoption
+            self._adoption = Adoption(controller.port, settings.gate)
+            self._service.weights = self._weights = WeightUpdateManager(
+                session, self.name, controller.port, self._adoption, settings.gate,
+                self._service.announce,
+            )  # fmt: skip
         inbox.watch("plant")
         inbox.announce("controller")
         if self._weights is not None:

@@ -18,7 +18,7 @@ from bayesrace.controller.interface import NO_LIMITS, Environment, StepOutput
 from bayesrace.errors import InputError
 from bayesrace.vehicles.parameters import Car
 
-__all__ = ["DrivingStyle", "PurePursuit", "PurePursuitSettings"]
+__all__ = ["DrivingStyle", "PurePursuit", "PurePursuitSettings", "dead_reckoning", "turning"]
 
 DrivingStyle = Literal["limit", "calm", "weave"]
 """limit: faster than the line allows, so that the car slides. calm: slower than the line. weave: in
@@ -80,6 +80,27 @@ class _Place(NamedTuple):
     """Of the room on that side: 0 on the line, 1 at the end."""
 
 
+def dead_reckoning(car: Car, x: Floats, u: Floats, duration_s: float) -> Floats:
+    """The state (7,) after so long: the velocities stay, the steering goes on at its rate."""
+    after = x.copy()
+    psi_mid = float(x[2]) + 0.5 * duration_s * float(x[5])
+    vx, vy = float(x[3]), float(x[4])
+    after[0] += duration_s * (vx * math.cos(psi_mid) - vy * math.sin(psi_mid))
+    after[1] += duration_s * (vx * math.sin(psi_mid) + vy * math.cos(psi_mid))
+    after[2] += duration_s * float(x[5])
+    delta = float(x[6]) + duration_s * float(u[1])
+    after[6] = min(max(delta, -car.delta_max_rad), car.delta_max_rad)
+    return after
+
+
+def turning(car: Car, delta_rad: float, target_rad: float, step_s: float) -> float:
+    """Steering rate [rad/s] with which the angle is that of the target after a period, or as near
+    to it as the car's limits allow."""
+    lowest = max(-car.delta_rate_max_radps, (-car.delta_max_rad - delta_rad) / step_s)
+    highest = min(car.delta_rate_max_radps, (car.delta_max_rad - delta_rad) / step_s)
+    return min(max((target_rad - delta_rad) / step_s, lowest), highest)
+
+
 class PurePursuit:
     """See the module; a :class:`bayesrace.controller.interface.ControlLaw`."""
 
@@ -124,7 +145,6 @@ class PurePursuit:
         self._random = np.random.default_rng(self._settings.seed)
         self._noise = np.zeros(2)
         self._output = StepOutput(u=np.zeros(2))
-        self._predicted = np.zeros(7)
 
     def _shape(self) -> None:
         """Directions, curvatures and accelerations of the line, (n,) each."""
@@ -147,17 +167,8 @@ class PurePursuit:
         self._noise[:] = 0.0
 
     def predict(self, x: Floats, u: Floats, duration_s: float) -> Floats:
-        """Dead reckoning: the velocities stay, the steering goes on at its rate."""
-        after = self._predicted
-        after[:] = x
-        psi_mid = float(x[2]) + 0.5 * duration_s * float(x[5])
-        vx, vy = float(x[3]), float(x[4])
-        after[0] += duration_s * (vx * math.cos(psi_mid) - vy * math.sin(psi_mid))
-        after[1] += duration_s * (vx * math.sin(psi_mid) + vy * math.cos(psi_mid))
-        after[2] += duration_s * float(x[5])
-        delta = float(x[6]) + duration_s * float(u[1])
-        after[6] = min(max(delta, -self._car.delta_max_rad), self._car.delta_max_rad)
-        return after
+        """As :func:`dead_reckoning`."""
+        return dead_reckoning(self._car, x, u, duration_s)
 
     def step(
         self,
@@ -175,11 +186,8 @@ class PurePursuit:
         excited_d, excited_delta = (1 - place.aside) * self._noise
         d = self._drive(place, float(x[3]), environment.speed_limit_mps) + float(excited_d)
         delta_target = self._steer(place, x) + float(excited_delta)
-        rate = (delta_target - delta) / settings.step_s
-        lowest = max(-car.delta_rate_max_radps, (-car.delta_max_rad - delta) / settings.step_s)
-        highest = min(car.delta_rate_max_radps, (car.delta_max_rad - delta) / settings.step_s)
         output.u[0] = min(max(d, car.d_min), car.d_max)
-        output.u[1] = min(max(rate, lowest), highest)
+        output.u[1] = turning(car, delta, delta_target, settings.step_s)
         output.numbers = {"s_ref_m": float(self._lengths[place.nearest])}
         return output
 

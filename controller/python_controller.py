@@ -22,11 +22,11 @@ class PythonController:
     port = None
     """It has nowhere to put weights."""
     weights_version = ""
-    track = ""
-    """Its law knows."""
 
-    def __init__(self, artefact: Path, law: ControlLaw) -> None:
-        """``artefact``: any built for a car; its control cycle is used, its step is not."""
+    def __init__(self, artefact: Path, law: ControlLaw, track: str = "") -> None:
+        """``artefact``: any built for a car; its control cycle is used, its step is not.
+        ``track``: identity of the one that the law drives; empty: the status does not say it."""
+        self.track = track
         self.nominal = NativeProblem(artefact)
         self.artefact = self.nominal.artefact
         self.law = law

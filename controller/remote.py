@@ -1,8 +1,6 @@
 """A controller that decides elsewhere, as its messages show it: what :class:`.Service` serves."""
 
-import os
-import select
-import socket
+import threading
 from collections import Counter
 from typing import Any, Final
 
@@ -12,7 +10,8 @@ from bayesrace import clock
 from bayesrace.controller.driver import Level, Phase
 from bayesrace.controller.estimator import Belief
 from bayesrace.controller.native_step import Status
-from bayesrace.errors import InputError
+from bayesrace.controller.ports import SerialPort, open_port
+from bayesrace.controller.weights.adoption import WeightsPort
 from bayesrace.messages import (
     COMMAND,
     SENSOR_FAULTS,
@@ -20,6 +19,9 @@ from bayesrace.messages import (
     Actuation,
     Command,
     Message,
+    Numbering,
+    Scalar,
+    Seal,
     State,
     Telemetry,
     from_datagram,
@@ -29,93 +31,78 @@ from bayesrace.messages import (
 
 __all__ = ["RemoteController", "RemoteDriver", "RemoteLink"]
 
-_LARGEST: Final = 1 << 16
 _STATE: Final = head_of(STATE)
-_LONGEST_PATH: Final = 107
 _REPEAT_NS: Final = 100_000_000
 """Between two commands that have had no effect yet: datagrams may be lost."""
+_FARTHEST: Final = 256
+"""From one state of a run to the next that is driven on; as ``controller/native/br_state.c``."""
 _SILENT_NS: Final = 1_000_000_000
 """Without a state for so long the controller waits for a plant."""
 
 
 class RemoteLink:
-    """Datagrams to and from a controller (docs/host.md): ``udp:ADDRESS:PORT``, ``unix:PATH``.
+    """Datagrams to and from a controller, by a link of docs/host.md but standard input.
 
     What others send is not received.
     """
 
-    def __init__(self, name: str, own: str = "") -> None:
-        """``own``: path that a Unix socket gets, to which the answers come. InputError for what is
-        no link."""
-        self.name = name
-        kind, _, self._path = name.partition(":")
-        self._address: str | None = None
+    def __init__(self, name: str, own: str = "", seal: Seal | None = None) -> None:
+        """``own``: path that a Unix socket gets, to which the answers come; ``seal``: of a
+        controller with a key. InputError for what is no link."""
+        self.name, self._seal, self._sending = name, seal, threading.Lock()
+        self._port = open_port(name, own)
         self.unsent = 0
         """Datagrams that could not be sent: no process listens there, or it is held up."""
-        if kind == "unix" and self._path and len(os.fsencode(self._path)) <= _LONGEST_PATH:
-            self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
-            self._socket.bind(own)
-            self._address = self._path
-        elif kind == "udp":
-            self._socket = _connected(name, self._path)
-        else:
-            raise InputError(f"'{name}' is no link: use udp:ADDRESS:PORT or unix:PATH")
-        self._socket.setblocking(False)
-        self._poll = select.poll()
-        self._poll.register(self._socket, select.POLLIN)
+        self.refused = False
+        """No process listens there: so the system has said since the newest datagram came."""
 
     def send(self, data: bytes) -> None:
         """Sends a datagram, or counts that it could not; never waits; from any thread."""
-        try:
-            if self._address is None:
-                self._socket.send(data)
-            else:
-                self._socket.sendto(data, self._address)
-        except OSError:
-            self.unsent += 1
+        with self._sending:  # in the order of the counters
+            sealed = data if self._seal is None else self._seal.sealed(data)
+            try:
+                self._port.send(sealed)
+            except OSError as error:
+                self._note(error)
+
+    def _note(self, error: OSError) -> None:
+        self.unsent += 1
+        self.refused = isinstance(error, ConnectionRefusedError | FileNotFoundError)
 
     def receive(self, timeout_s: float) -> bytes | None:
-        """The next datagram; None if there is none in time."""
-        if not self._poll.poll(1e3 * timeout_s):
-            return None
+        """The next datagram; None if there is none in time. RestartError where none can come."""
         try:
-            data, sender = self._socket.recvfrom(_LARGEST)
-        except OSError:  # of a datagram that was sent before
-            self.unsent += 1
+            data = self._port.receive(timeout_s)
+        except OSError as error:  # of a datagram that was sent before
+            self._note(error)
             return None
-        return data if self._address is None or sender == self._address else None
+        if data is not None:
+            self.refused = False
+            if self._seal is not None:
+                return self._seal.opened(data)
+        return data
+
+    def counters(self) -> dict[str, Scalar]:
+        """What did not get through."""
+        counts: dict[str, Scalar] = {"unsent": self.unsent}
+        if isinstance(self._port, SerialPort):
+            counts["bad_frames"] = self._port.frames.bad
+        if self._seal is not None:
+            counts |= {"forged": self._seal.forged, "replayed": self._seal.replayed}
+        return counts
 
     def close(self) -> None:
         """No more datagrams."""
-        self._socket.close()
-
-
-def _connected(name: str, where: str) -> socket.socket:
-    host, _, port = where.rpartition(":")
-    numeric = socket.AI_NUMERICHOST | socket.AI_NUMERICSERV
-    try:
-        if not host or not 0 < int(port) < 1 << 16:
-            raise ValueError
-        (found, *_) = socket.getaddrinfo(
-            host.removeprefix("[").removesuffix("]"), port, type=socket.SOCK_DGRAM, flags=numeric
-        )
-        made = socket.socket(found[0], socket.SOCK_DGRAM)
-        made.connect(found[4])
-    except (OSError, ValueError, OverflowError):
-        raise InputError(
-            f"'{name}' is no link: use udp:ADDRESS:PORT, such as udp:127.0.0.1:7450, or unix:PATH"
-        ) from None
-    return made
+        self._port.close()
 
 
 class RemoteController:
     """What a status says of the controller itself."""
 
-    port = None
-
-    def __init__(self, track: str) -> None:
-        """``track``: identity of the track that it drives."""
-        self.track = track
+    def __init__(self, track: str, port: WeightsPort | None) -> None:
+        """``track``: identity of the track that it drives; ``port``: None if it takes no weights
+        while it drives."""
+        self.track, self.port = track, port
         self.weights_version = ""
 
 
@@ -126,11 +113,14 @@ class RemoteDriver:
     link's, all else by the one that serves.
     """
 
-    def __init__(self, link: RemoteLink, track: str) -> None:
-        self.controller = RemoteController(track)
+    def __init__(self, link: RemoteLink, track: str, port: WeightsPort | None = None) -> None:
+        """As :class:`RemoteController`."""
+        self.controller = RemoteController(track, port)
         self.last_error, self.faulty, self.delay_s = "is not reported", "", 0.0
         self.newest: State | None = None
-        """The newest state that has come."""
+        """The newest state that has come of the run that is driven."""
+        self.numbering, self.foreign = Numbering(), 0
+        """Of these states; how many were of other runs or plants."""
         self.belief: Belief | None = None
         """What the controller estimates the car's state to be; None: it is measured."""
         self.instruments: dict[str, Any] = {}
@@ -146,13 +136,38 @@ class RemoteDriver:
         the newest state."""
         self._wanted, self._commands, self._commanded_ns = "", 0, 0
 
-    def take(self, state: State) -> None:
-        """A state has come, to be forwarded next."""
+    def take(self, state: State) -> bool:
+        """A state has come, to be forwarded next; whether it is of the run that is driven."""
+        if not self._continues(state):
+            self.foreign += 1
+            return False
+        if self.newest is not None and self.newest.epoch != state.epoch:
+            self.numbering.restart()
+        self.numbering.note(state.seq)
         self.newest, self._arrived_ns = state, clock.monotonic_ns()
         if state.final:
             self._unanswered_since_ns = 0  # it gets no answer, nor may those before it
         elif not self._unanswered_since_ns:
             self._unanswered_since_ns = self._arrived_ns
+        return True
+
+    def _continues(self, state: State) -> bool:
+        """Whether it goes on from the newest, or from what the controller has answered: it decides
+        which run it drives."""
+        newest, answer = self.newest, self._answer
+        if newest is None or answer is None or newest.final or self.silent:
+            return True
+        return any(
+            (state.epoch, state.run) == (epoch, run) and abs(state.seq - seq) <= _FARTHEST
+            for epoch, run, seq in (
+                (newest.epoch, newest.run, newest.seq),
+                (answer.epoch, answer.run, answer.state_seq),
+            )
+        )
+
+    def excuse(self) -> None:
+        """Forgets for how long a state has had no answer: this process did not run meanwhile."""
+        self._unanswered_since_ns = 0
 
     def forward(self, payload: bytes) -> None:
         """The state that was taken, as it has come."""

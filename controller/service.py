@@ -160,8 +160,10 @@ class Service:
 
     @property
     def _drives(self) -> bool:
-        """Also of a stop on request: the phase follows with the next cycle."""
-        return self._driver.phase in (Phase.DRIVING, Phase.FALLBACK) and not self._stopped
+        """Whether the car drives and has not been told to stop: the phase changes only later, of a
+        controller elsewhere when the car stands."""
+        stopped = self._stopped or self._let_go
+        return self._driver.phase in (Phase.DRIVING, Phase.FALLBACK) and not stopped
 
     def react(self, item: Item) -> None:
         """Serves an item that is no message."""

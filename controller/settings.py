@@ -1,6 +1,7 @@
 """Run-time settings: of the OCP (paper, equation 8) and the SQP that solves it; of the control
 cycle around the step, its fallback and delay compensation; and of the checks of new weights."""
 
+import math
 from statistics import NormalDist
 from typing import Annotated, Any, Final, Literal, get_args
 
@@ -8,6 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator, model_valida
 
 from bayesrace.defaults import Option
 from bayesrace.vehicles import Car
+from bayesrace.vehicles.parts import GRAVITY_MPS2
 
 __all__ = [
     "SAMPLES", "WATCHED", "CompensationMode", "CompensationSettings", "CycleSettings",
@@ -25,6 +27,9 @@ _SOLVER: Final = (
     "qp_steps",
 )  # fmt: skip
 """BR_SOLVER_FIELDS in controller/native/bayesrace_mpc.h that have the names of settings."""
+
+_BEND: Final = 5.0
+"""Wheelbases: radius of the bend that a car still takes at its limit where weights slow it down."""
 
 
 def _objective(text: str) -> Any:
@@ -208,6 +213,20 @@ class GateSettings(BaseModel):
         0.7, gt=0, le=1, description="of the fastest speed that was watched: the limit where going "
         "back would be no better",
     )  # fmt: skip
+
+    def probation(self, car: Car, step_s: float) -> dict[str, Any]:
+        """The members of br_mpc_probation (controller/native/bayesrace_mpc.h) by name."""
+        bend_m = _BEND * car.wheelbase_m
+        return {
+            "worse_factor": self.worse_factor,
+            "worse_share": self.worse_share,
+            "watch_samples": self.watch_s / step_s,
+            "slow_share": self.slow_share,
+            "slow_least_mps": math.sqrt(car.friction * GRAVITY_MPS2 * bend_m),
+            "watch_least": self.watch_least,
+            "watch_cycles": self.watch_cycles,
+            "resolution": tuple(one * step_s for one in car.tuning.gate.resolution),
+        }
 
 
 class CycleSettings(BaseModel):

@@ -92,6 +92,8 @@ class LogFacts:
     """The recorded car; None if the log does not name it."""
     discretisation: Discretisation | None
     """The one that its controller predicted with; None if the log does not name it."""
+    track: str = ""
+    """Name of the track that was driven; empty if the log does not name it."""
 
 
 def log_facts(path: str | os.PathLike[str]) -> LogFacts:
@@ -111,6 +113,7 @@ def log_facts(path: str | os.PathLike[str]) -> LogFacts:
             true=frozenset(name for topic, name in keys if topic is TRUTH),
             car=described_car(settings["car"]) if settings.get("car") else None,
             discretisation=None if given is None else Discretisation.model_validate(given),
+            track=str(settings.get("track") or ""),
         )
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
@@ -233,22 +236,19 @@ def _read(path: Path) -> "_File":
     try:
         with zipfile.ZipFile(path) as archive:
             if sum(member.file_size for member in archive.infolist()) > MAX_BYTES:
-                raise InputError(f"{path}: more than {MAX_BYTES >> 20} MB; split it")
+                raise InputError(f"more than {MAX_BYTES >> 20} MB; split it")
         with np.load(path, allow_pickle=False) as file:
             arrays = {name: np.asarray(file[name]) for name in file.files}
+        car = arrays.get("car")
+        if car is not None and (car.shape != () or car.dtype.kind != "U"):
+            raise InputError("'car' must be one text")
+        return _File(path, arrays, None if car is None else described_car(str(car)))
     except OSError as error:
         raise InputError(f"cannot read {path}: {error.strerror or error}") from error
-    except InputError:
-        raise
-    except Exception as error:  # damage raises anything of zipfile, zlib, lzma or numpy
-        raise InputError(f"{path}: not arrays as numpy.savez writes them ({error})") from error
-    car = arrays.get("car")
-    if car is not None and (car.shape != () or car.dtype.kind != "U"):
-        raise InputError(f"{path}: 'car' must be one text")
-    try:
-        return _File(path, arrays, None if car is None else described_car(str(car)))
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
+    except Exception as error:  # damage raises anything of zipfile, zlib, lzma or numpy
+        raise InputError(f"{path}: not arrays as numpy.savez writes them ({error})") from error
 
 
 @dataclass(frozen=True)
@@ -288,9 +288,7 @@ class _File:
             raise InputError("'step_s' must be one number of seconds, above 0 and at most 1")
         if "states" in names:
             return dataset_from_arrays(self.car, float(step_s), *self._numbers(*_DRIVE))
-        known = None
-        if "deviation" in names:
-            known = Estimates.settled(*self._numbers("deviation"))
+        known = Estimates.settled(*self._numbers("deviation")) if "deviation" in names else None
         return Dataset(self.car, float(step_s), *self._numbers(*_SAMPLES), estimates=known)
 
     def _is_published(self) -> bool:
@@ -402,7 +400,8 @@ def _driver(path: Path, facts: LogFacts, name: str) -> str:
         raise InputError(
             f"{path} holds states of {found}"
             + (f", not of '{name}': give the car that drove with --car, or its name in the network "
-               "with --name" if facts.names else "; give the log of a drive")
+               "with --name" if facts.names else "; give the log of a drive, or make one of what "
+               "others have recorded with 'bayesrace import-drive'")
         )  # fmt: skip
     return names[0]
 

@@ -20,7 +20,7 @@ from threadpoolctl import threadpool_limits
 from bayesrace.arrays import Flags, Floats, Rows
 from bayesrace.errors import InputError
 from bayesrace.gp.expression import corrected_function, evaluate_mean
-from bayesrace.gp.weights import OUTPUTS, Weights
+from bayesrace.gp.weights import OUTPUTS, GpOutput, Weights
 from bayesrace.integrators import Discretisation
 from bayesrace.learning.dataset import Dataset
 from bayesrace.learning.gaussian_process import Covariance, Posterior
@@ -30,7 +30,7 @@ from bayesrace.vehicles.models import STATES, e_kinematic
 from bayesrace.vehicles.parameters import Car
 
 __all__ = ["HORIZON", "NOMINAL", "Validation", "discretisation_of", "identity", "mismatch"]
-__all__ += ["predictive_sigma", "recalled", "residual", "unbroken", "validate"]
+__all__ += ["posterior_of", "predictive_sigma", "recalled", "residual", "unbroken", "validate"]
 
 HORIZON: Final = 20
 """Stages of the controller's default horizon."""
@@ -140,17 +140,22 @@ class Validation:
         return np.asarray(self.sigma.max(axis=1) > threshold)
 
 
+def posterior_of(output: GpOutput) -> Posterior:
+    """The GP of an output, in units of scaled y; InputError if its covariance is singular."""
+    covariance = Covariance(
+        output.kernel, output.signal_variance, output.length_scales, output.noise_variance
+    )
+    found = Posterior(covariance, output.inputs, np.zeros(output.count))
+    # The uncertainty does not depend on the targets, which weights do not hold.
+    found.alpha = output.alpha
+    return found
+
+
 def predictive_sigma(weights: Weights, z: Floats) -> Floats:
     """Predictive standard deviation (m, 3) at features ``z`` (m, 6), noise included, SI units."""
-    columns = []
-    for output in weights.outputs:
-        covariance = Covariance(
-            output.kernel, output.signal_variance, output.length_scales, output.noise_variance
-        )
-        # The uncertainty does not depend on the targets.
-        _, sigma = Posterior(covariance, output.inputs, np.zeros(output.count)).predict(z)
-        columns.append(output.y_scale * sigma)
-    return np.column_stack(columns)
+    return np.column_stack(
+        [output.y_scale * posterior_of(output).predict(z)[1] for output in weights.outputs]
+    )
 
 
 def validate(weights: Weights, dataset: Dataset, discretisation: Discretisation) -> Validation:

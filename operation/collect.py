@@ -233,9 +233,7 @@ def pursuit_controller(
     law = PurePursuit(
         car, line.x_m, line.y_m, line.vx_mps, settings, room_m=room_beside(course, line)
     )
-    controller = PythonController(artefact, law)
-    controller.track = course.identity
-    return controller
+    return PythonController(artefact, law, course.identity)
 
 
 def training_margin_m(track: Track, car: Car, margin_m: float | None = None) -> float:

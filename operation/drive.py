@@ -12,6 +12,7 @@ from bayesrace.operation.analysis.laps import Verdict, judge_log
 from bayesrace.operation.run_plan import RunPlan, announcement, run_request
 from bayesrace.raceline import same_track
 from bayesrace.recorder import Recorder
+from bayesrace.scene import Scene
 from bayesrace.tracks import Track
 from bayesrace.transport import Director, Endpoints, Publisher, RefusedError, open_session
 from bayesrace.vehicles import Car, car_text
@@ -93,11 +94,12 @@ def drive_and_judge(
     """
     endpoints.check_car(name)
     about = {"drive": {"car": car_text(car), "track": track.name}}
+    scene = Scene(car, track, name=name)
     end: Event | None = None
     try:
         with (
             open_session(endpoints, "director") as session,
-            Recorder(session, name, log, about, most_bytes) as recorder,
+            Recorder(session, name, log, about, most_bytes, scene) as recorder,
         ):
             director = Director(session, name)
             director.wait_for(("plant", "controller"), 10.0)

@@ -12,8 +12,8 @@ from typing import Any
 from bayesrace.codegen.build import PROGRAM, host_program
 from bayesrace.codegen.compiler import Compiler, find_compiler
 from bayesrace.codegen.host_files import export
-from bayesrace.controller.assembly import make_path_table
-from bayesrace.controller.settings import CycleSettings, MpcSettings
+from bayesrace.controller.assembly import path_table_for
+from bayesrace.controller.settings import CycleSettings, GateSettings, MpcSettings
 from bayesrace.errors import InputError
 from bayesrace.files import write_whole
 from bayesrace.gp.weights import Weights
@@ -53,8 +53,9 @@ def drives_by(
 ) -> dict[str, Any]:  # fmt: skip
     """What a controller's files and FMU are made from: the line as ``rows`` every ``spacing_m``,
     ``settings`` of problem and solver, ``weights``."""
-    table = make_path_table(track, line, car.tuning.path.spacing_m)
-    settings = mpc.parameters(car, read_manifest(artefact).problem.name)
+    manifest = read_manifest(artefact)
+    table = path_table_for(manifest, car, track, line)
+    settings = mpc.parameters(car, manifest.problem.name)
     return {
         "rows": table.rows, "spacing_m": table.spacing_m, "settings": settings, "weights": weights
     }  # fmt: skip
@@ -67,8 +68,11 @@ def export_for(
     """Writes what the program drives by: racing line, weights, and all settings in one file."""
     given = drives_by(artefact, car, track, line, weights, mpc)
     values = given["settings"] | CycleSettings().cycle_values(car)
-    values |= car.tuning.estimation(nominal=weights is None)
     manifest = read_manifest(artefact)
+    values |= GateSettings().probation(car, manifest.step_s)
+    learned = car.tuning.estimation(nominal=False)
+    values |= car.tuning.estimation(nominal=True)
+    values |= {f"learned_{name}": learned[name] for name in ("acceleration", "acceleration_s")}
     export(folder, manifest, given["rows"], given["spacing_m"], values, weights)
 
 

@@ -47,6 +47,7 @@ from bayesrace.plant.simulator import PLANT
 from bayesrace.plant.vehicle import FmuFault, open_vehicle
 from bayesrace.plant.world import write_world
 from bayesrace.recorder import Recorder
+from bayesrace.scene import Scene
 from bayesrace.sensors import write_sensors
 from bayesrace.tracks import load_track
 from bayesrace.transport import RefusedError
@@ -123,9 +124,10 @@ def _compare(settings: RaceSettings, out: Path, stages: Stages) -> Recording:
             shutil.copyfile(progress / MANIFEST, out / "manifest-progress.json")
     about = {"race": {"settings": settings.model_dump_json()}}
     name, lockstep = settings.driven_car.name, settings.mode == "lockstep"
+    scene = Scene(settings.driven_car, prepared.first.track, prepared.first.line)
     with (
         started_system(name, out, plant_options(copied, out), lockstep=lockstep) as system,
-        Recorder(system.recording, name, out / _LOG, about) as recorder,
+        Recorder(system.recording, name, out / _LOG, about, scene=scene) as recorder,
         _faults_named(InputError),
     ):
         drives = Drives(settings, out, stages, prepared, system, recorder)
@@ -332,7 +334,8 @@ class Drives:
         driven: RunPlan | None = None
         for number in range(1, self._settings.progress_runs + 1):
             if driven is not None:
-                weights = self._updated(driven, weights, "weights-limit.bin", f", {number}")
+                file = f"weights-limit-{number}.bin"
+                weights = self._updated(driven, weights, file, f", {number}")
             with self._stages.stage(f"drive BayesRace-limit, {number}"):
                 name = "bayesrace-limit"
                 driven = self.drive(name) if driven is None else self._drive_with(weights, name)

@@ -160,16 +160,16 @@ def _files(folder: Path | None, names: Iterable[str], option: str) -> tuple[Path
 _SPAN: Final = re.compile(r"(.*?)(\d{1,9})\.\.(\d{1,9})")
 
 
-def spread(value: Any, most: int = 1_000_000) -> list[Any]:
+def spread(value: Any) -> list[Any]:
     """``TEXT A..B`` as TEXT with each number, or as numbers alone; all else as it is.
 
-    Of more than ``most`` numbers, one more than that.
+    Of more than a million numbers, one more than that.
     """
     match = _SPAN.fullmatch(value) if isinstance(value, str) else None
     if match is None:
         return [value]
     text, first, last = match[1], int(match[2]), int(match[3])
-    numbers = range(first, min(last, first + most) + 1)
+    numbers = range(first, min(last, first + 1_000_000) + 1)
     return [f"{text}{number}" if text else number for number in numbers]
 
 

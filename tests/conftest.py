@@ -7,10 +7,12 @@ import os
 import re
 import shutil
 import subprocess
+import sys
 import tempfile
 from collections.abc import Callable, Generator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,22 +21,26 @@ from numpy.typing import ArrayLike
 from bayesrace.arrays import Floats
 from bayesrace.cache import code_folder
 from bayesrace.codegen.build import build
+from bayesrace.codegen.daqp import VERSION
 from bayesrace.codegen.problems.tracking import tracking
 from bayesrace.codegen.settings import BuildSettings
-from bayesrace.controller.assembly import PathTable, make_path_table
+from bayesrace.controller.assembly import PathTable, PredictiveController, make_path_table
 from bayesrace.controller.native_step import NativeStep
 from bayesrace.controller.settings import MpcSettings
 from bayesrace.errors import InputError
 from bayesrace.gp.expression import kernel_matrix
 from bayesrace.gp.weights import KERNELS, GpOutput, Weights
 from bayesrace.integrators import PREDICTION, Discretisation
+from bayesrace.log import LogReader, LogWriter
+from bayesrace.operation.closed_loop import ClosedLoop
+from bayesrace.operation.host import HostProgram
 from bayesrace.raceline.line import RaceLine
 from bayesrace.tracks import Track
 from bayesrace.vehicles import Car, get_car
 from bayesrace.vehicles.models import Model, dynamic, e_kinematic
 from tests.command_line import cli
 from tests.programs import Race, leftovers, peanut
-from tests.shared import session_folder
+from tests.shared import session_folder, shared_folder
 from tests.zig import ziglang
 
 __all__ = ["cli", "ziglang"]  # fixtures for all tests
@@ -303,6 +309,7 @@ def ready(
     return step
 
 
+Driven = Callable[..., LogReader]
 Make = Callable[..., NativeStep]
 
 
@@ -356,3 +363,44 @@ def peanut_race(peanut_track: Path, tmp_path_factory: pytest.TempPathFactory) ->
     folder = session_folder(tmp_path_factory, "race", make)
     text = (folder / "stdout").read_text()
     return Race(folder / "run", 0, subprocess.CompletedProcess([], 0, text, ""))
+
+
+@pytest.fixture(scope="session")
+def host(
+    tmp_path_factory: pytest.TempPathFactory, kinematic_artefact: Path, circuit: Circuit,
+    car: Car, weights: Weights,
+) -> HostProgram:  # fmt: skip
+    folder = tmp_path_factory.mktemp("host")
+    return HostProgram.made(
+        folder, kinematic_artefact, car, circuit.track, circuit.line, weights, SETTINGS
+    )
+
+
+@pytest.fixture
+def driven(native: NativeStep, circuit: Circuit, car: Car, tmp_path: Path) -> Driven:
+    """The log of a lockstep drive with the controller in Python."""
+
+    def drive(max_time_s: float = 60.0, **given: Any) -> LogReader:
+        log = LogWriter(tmp_path / "log.mcap")
+        controller = PredictiveController(native)
+        loop = ClosedLoop(car, circuit.track, circuit.line, controller, log=log, **given)
+        loop.drive(1, max_time_s=max_time_s)
+        log.close()
+        return LogReader(tmp_path / "log.mcap")
+
+    return drive
+
+
+@pytest.fixture(scope="session")
+def daqp() -> Path:
+    """Its source distribution, of the package index."""
+    wanted = f"daqp=={VERSION}"
+
+    def download(folder: Path) -> None:
+        line = [sys.executable, "-m", "pip", "download", "-q", "--no-deps", "--no-binary", "daqp"]
+        subprocess.run([*line, wanted, "-d", folder], check=True, timeout=600)
+
+    try:
+        return next(shared_folder("daqp", [wanted], download).glob("daqp-*.tar.gz"))
+    except (subprocess.SubprocessError, StopIteration) as error:
+        pytest.skip(f"{wanted} cannot be downloaded: {error}")

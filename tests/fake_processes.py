@@ -42,6 +42,7 @@ class Fake:
     refuses: str = ""
     beats: bool = True
     text: str = "all is well"
+    track: str = ""
     heard: list[Command] = field(default_factory=list)
     clock_s: float = 0.0
     """How far the clock of its machine is ahead."""
@@ -54,6 +55,7 @@ class Fake:
         return messages.status(
             seq=seq, **here, source=self.source, phase=phase, epoch=7, run=2, text=self.text,
             weights_version="v3", rate_hz=rate, state_age_s=age, delay_s=0.034, counters=COUNTERS,
+            track=self.track,
         )  # fmt: skip
 
     def serve(self, ready: threading.Event, over: threading.Event) -> None:

@@ -21,12 +21,15 @@ from bayesrace.errors import InputError
 from bayesrace.log import LogReader
 from bayesrace.messages import TRUTH, BrakingPlan, State
 from bayesrace.operation.closed_loop import ClosedLoop
+from bayesrace.operation.host import HostProgram
 from bayesrace.operation.run_plan import RunPlan, run_request
 from bayesrace.operation.system import started_system
 from bayesrace.plant.car import End
 from bayesrace.plant.vehicle import planned_at
 from bayesrace.recorder import Recorder
+from tests.network.cars import free_port, started_host
 from tests.racing import Racing, prepared, racing
+from tests.recovery import bridge_command, hosted
 from tests.reference import reference_file
 
 CUT_S = 0.4
@@ -139,22 +142,27 @@ class Loss:
     end_mps: float
 
 
-def lose(out: Path, what: signal.Signals | None, after_s: float) -> Loss:
+def lose(out: Path, what: signal.Signals | None, after_s: float, host: HostProgram | None) -> Loss:
     """One drive on harbour; a controller that is only paused goes on after 3 s.
 
-    Without a signal the director of a held run is lost, whose loop goes round no more.
+    Without a signal the director of a held run is lost, whose loop goes round no more. ``host``:
+    the controller without Python; it alone gets the signal, not its bridge.
     """
     files, car = prepared(), "orca"
     track = files.first.track
     with ExitStack() as stack:
-        system = stack.enter_context(started_system(car, out))
+        own, link = {}, f"udp:127.0.0.1:{free_port()}"
+        if host is not None:
+            program = stack.enter_context(started_host(host, link))
+            own["controller"] = bridge_command(link, files.first.track_file, out)
+        system = stack.enter_context(started_system(car, out, own=own))
         controllers = stack.enter_context(ExitStack())
         controllers.enter_context(system.controller(files.arguments))
         with Recorder(system.session, car, out / "run.mcap"):
             plan = RunPlan(1, "bayesrace", 1, 60.0, lockstep=False, held=what is None)
             request = msgspec.structs.replace(run_request(track, plan), laps=0)
             system.director.start(request)
-            pid = system.children["controller"].pid
+            pid = system.children["controller"].pid if host is None else program.pid
             if what is None:
                 with pytest.raises(InputError, match="did not end"):
                     system.director.wait_for_end(1, after_s)
@@ -185,20 +193,35 @@ def lose(out: Path, what: signal.Signals | None, after_s: float) -> Loss:
     )
 
 
+@pytest.fixture(scope="module")
+def host(tmp_path_factory: pytest.TempPathFactory) -> HostProgram:
+    """The controller without Python, for harbour."""
+    return hosted(prepared(), tmp_path_factory.mktemp("host"))
+
+
+LOSSES = (signal.SIGKILL, signal.SIGHUP, signal.SIGSTOP, None)
+MOMENTS_S = (9.0, 10.7, 12.4)
+
+
 @pytest.mark.check
 @pytest.mark.wall_clock
 @pytest.mark.unmeasured
-@pytest.mark.parametrize("what", [signal.SIGKILL, signal.SIGHUP, signal.SIGSTOP, None])
-@pytest.mark.parametrize("after_s", [9.0, 10.7, 12.4])
+@pytest.mark.parametrize(
+    ("language", "what", "after_s"),
+    [("Python", what, after_s) for what in LOSSES for after_s in MOMENTS_S]
+    + [("C", what, after_s) for what, after_s in zip(LOSSES[::-1], MOMENTS_S, strict=False)],
+)
 def test_a_controller_or_director_that_is_lost_at_racing_speed(
-    tmp_path: Path, what: signal.Signals | None, after_s: float
-) -> None:
+    tmp_path: Path, language: str, what: signal.Signals | None, after_s: float,
+    request: pytest.FixtureRequest,
+) -> None:  # fmt: skip
     """A controller killed, its terminal closed, or paused for 3 s, after which it drives on; the
     director of a held run, for good."""
+    host = request.getfixturevalue("host") if language == "C" else None
     for attempt in range(3):
         out = tmp_path / str(attempt)
         out.mkdir()
-        loss = lose(out, what, after_s)
+        loss = lose(out, what, after_s, host)
         if loss.before_m <= 0 and loss.again_m <= 0:
             break
         assert loss.after_m <= 0 or loss.before_m > 0

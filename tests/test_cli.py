@@ -22,9 +22,9 @@ EVIL = "a\x1b[2Jb\x07c"
 """Of which a terminal would obey a part."""
 
 SUBCOMMANDS = (
-    "race", "drive", "report", "bench", "tracks", "cars", "raceline", "collect", "identify",
-    "train", "build", "export", "limit",
-    "plant", "controller", "bridge", "shadow", "status", "stop", "go", "router", "latency",
+    "race", "drive", "report", "view", "bench", "tracks", "cars", "raceline", "collect", "identify",
+    "import-drive", "train", "size", "build", "export", "limit",
+    "plant", "controller", "bridge", "ros2", "shadow", "status", "stop", "go", "router", "latency",
     "timing",
     "fmu export", "fmu inspect", "fmu weights",
     "validate", "publish", "rollback", "learn",

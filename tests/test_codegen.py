@@ -21,7 +21,7 @@ import pytest
 import bayesrace.cache as cache_module
 import bayesrace.codegen.build as build_module
 from bayesrace.cache import cache_folder
-from bayesrace.codegen.build import build, build_hash, generate
+from bayesrace.codegen.build import build, build_hash, checking_artefact, generate
 from bayesrace.codegen.compiler import FLAGS, CompileError, Compiler, find_compiler
 from bayesrace.codegen.platforms import get_platform, host_platform
 from bayesrace.codegen.problems.driving import linearise_function
@@ -42,6 +42,7 @@ from bayesrace.manifest import (
     Manifest,
     opened_library,
     read_manifest,
+    runs_here,
 )
 from bayesrace.messages.types import BRAKING_ROWS, SENSOR_FAULTS
 from bayesrace.operation.cli import export
@@ -559,3 +560,18 @@ def test_what_another_platform_lacks_is_said_in_a_line(kinematic_artefact: Path)
     with pytest.raises(InputError, match="does not compile for aarch64-linux: set CC to"):
         arm.check(kinematic_artefact / LIBRARY, find_compiler())
     host_platform().check(kinematic_artefact / LIBRARY, find_compiler())
+
+
+def test_a_controller_for_another_processor_has_one_here_that_checks_its_weights(
+    artefact: Path, tmp_path: Path, car: Car
+) -> None:
+    foreign = Path(shutil.copytree(artefact, tmp_path / "foreign"))
+    data = bytearray((foreign / LIBRARY).read_bytes())
+    data[18] ^= 1  # the machine, in the head of the file
+    (foreign / LIBRARY).write_bytes(data)
+    assert (runs_here(artefact), runs_here(foreign)) == (True, False)
+    here = checking_artefact(foreign, car)
+    assert runs_here(here)
+    assert read_manifest(here).discretisation == read_manifest(foreign).discretisation
+    with pytest.raises(InputError, match="was built for car"):
+        checking_artefact(foreign, get_car("f1tenth"))

@@ -7,13 +7,18 @@ from typing import Any
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from bayesrace.arrays import Floats
 from bayesrace.controller.driver import Driver
 from bayesrace.controller.interface import StepOutput
 from bayesrace.controller.settings import CompensationSettings
-from bayesrace.messages import Numbering
+from bayesrace.messages import Numbering, State
+from bayesrace.operation.host import HostProgram
 from tests.cycle_rig import STEP_S, ScriptedLaw, scripted_driver, state
+from tests.exchanged import racing_host
+
+__all__ = ["racing_host"]  # a fixture
 
 
 def exact(x: Floats, u: Floats, duration_s: float) -> Floats:
@@ -149,11 +154,13 @@ def test_a_run_goes_on_with_rising_numbers_and_another_plant_begins_anew(driver:
     assert made.interval_s == pytest.approx(STEP_S)
 
 
-@pytest.mark.parametrize(
-    "odd",
-    [{"seq": 1100}, {"seq": 2**63 - 1}, {"epoch": 2}, {"run": 2}, {"seq": 0}],
-    ids=["ahead", "far ahead", "epoch", "run", "behind"],
-)
+ODD: dict[str, dict[str, Any]] = {
+    "ahead": {"seq": 1100}, "far ahead": {"seq": 2**63 - 1}, "epoch": {"epoch": 2},
+    "run": {"run": 2}, "behind": {"seq": 0},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("odd", ODD.values(), ids=ODD)
 def test_one_foreign_state_is_counted_and_nothing_else(driver: Make, odd: dict[str, Any]) -> None:
     made = driver()
     assert made.observe(state(100))
@@ -196,6 +203,29 @@ def test_two_plants_at_once_are_not_mixed(driver: Make) -> None:
         assert made.observe(state(seq, epoch=1))
         assert not made.observe(state(seq, epoch=2))
     assert made.count("foreign") == 50
+
+
+def test_the_controller_without_python_drives_on_the_same_states(
+    driver: Make, racing_host: HostProgram, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In the tests above: it answers them, and no others."""
+    observed: dict[Driver, list[tuple[State, bool]]] = {}
+    observe = Driver.observe
+
+    def observing(made: Driver, one: State) -> bool:
+        observed.setdefault(made, []).append((one, observe(made, one)))
+        return observed[made][-1][1]
+
+    monkeypatch.setattr(Driver, "observe", observing)
+    for odd in ODD.values():
+        test_one_foreign_state_is_counted_and_nothing_else(driver, odd)
+    test_a_gap_of_a_quarter_second_is_a_loss_at_any_rate(driver)
+    test_two_plants_at_once_are_not_mixed(driver)
+    for states in observed.values():
+        answers = racing_host.answers(replace(one, lockstep=True) for one, _ in states)
+        expected = [(one.epoch, one.run, one.seq) for one, new in states if new]
+        assert [(one.epoch, one.run, one.state_seq) for one, _ in answers] == expected
+    assert len(observed) == len(ODD) + 2
 
 
 def test_losses_are_counted_also_when_the_first_message_of_a_restarted_sender_is_lost() -> None:

@@ -5,18 +5,23 @@ import signal
 import subprocess
 import time
 from collections.abc import Iterator
+from contextlib import ExitStack
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 
 import pytest
 
+from bayesrace.controller.settings import MpcSettings
 from bayesrace.log import LogReader
 from bayesrace.messages import ACTUATION, EVENT, STATE, TELEMETRY
 from bayesrace.operation.doctor import probe
+from bayesrace.operation.host import HostProgram
 from bayesrace.transport import free_endpoint
+from bayesrace.vehicles import Car
 from tests.command_line import Cli, course_files, refused
 from tests.conftest import Circuit
+from tests.network.cars import free_port, started_host
 from tests.programs import finish, peanut, run, start, until
 
 LONG = ("--laps", "10000", "--max-time", "3600")
@@ -100,6 +105,8 @@ class Waiting:
 
     plant: subprocess.Popen[str]
     controller: subprocess.Popen[str]
+    bridge: subprocess.Popen[str]
+    """Of a controller without Python; else the controller itself."""
     plant_at: str
     where: tuple[str, ...]
     """Endpoints of both, as options."""
@@ -116,24 +123,42 @@ class Waiting:
         return drive
 
 
+BOTH = pytest.mark.parametrize(
+    "waiting", ["Python", pytest.param("C", marks=pytest.mark.check)], indirect=True
+)
+"""By the controller in Python, and by that without and its bridge."""
+
+
 @pytest.fixture
 def waiting(
-    course: tuple[str | Path, ...], kinematic_artefact: Path, ended: list[subprocess.Popen[str]]
-) -> Waiting:
+    course: tuple[str | Path, ...], kinematic_artefact: Path, ended: list[subprocess.Popen[str]],
+    circuit: Circuit, car: Car, tmp_path: Path, request: pytest.FixtureRequest,
+) -> Iterator[Waiting]:  # fmt: skip
     plant_at, controller_at = free_endpoint(), free_endpoint()
     plant = start("plant", "--endpoint", plant_at)
-    files = ("--artefact", kinematic_artefact, *course)
-    controller = start("controller", *files, "--endpoint", plant_at, "--listen", controller_at)
-    ended += [plant, controller]
-    where = ("--endpoint", plant_at, "--endpoint", controller_at)
-    return Waiting(plant, controller, plant_at, where, course[:2], ended)
+    where = ("--endpoint", plant_at, "--listen", controller_at)
+    with ExitStack() as stack:
+        if getattr(request, "param", "Python") == "C":
+            link = f"udp:127.0.0.1:{free_port()}"
+            drives_by = car, circuit.track, circuit.line, None, MpcSettings()
+            host = HostProgram.made(tmp_path, kinematic_artefact, *drives_by)
+            controller = stack.enter_context(started_host(host, link))
+            bridge = start("bridge", link, *course[:2], *where)
+        else:
+            files = ("--artefact", kinematic_artefact, *course)
+            bridge = controller = start("controller", *files, *where)
+        ended += [plant, bridge]
+        both = ("--endpoint", plant_at, "--endpoint", controller_at)
+        yield Waiting(plant, controller, bridge, plant_at, both, course[:2], ended)
 
 
+@BOTH
 def test_drive_refuses_another_track_than_the_controllers(cli: Cli, waiting: Waiting) -> None:
     outcome = cli("drive", "--track", "paddock", *waiting.where)
     refused(outcome, "the controller drives the track '", "this run is on 'paddock-", "--track")
 
 
+@BOTH
 @pytest.mark.check
 def test_drive_says_when_the_controller_is_lost(tmp_path: Path, waiting: Waiting) -> None:
     """The run breaks off, so drive fails; the plant is ready for the next controller."""
@@ -181,20 +206,25 @@ def driven_after_a_pause(log: Path) -> bool:
 
 @pytest.mark.check
 @pytest.mark.wall_clock
+@BOTH
 @pytest.mark.parametrize("mode", ["realtime", "lockstep"])
 def test_a_suspended_machine_is_named(tmp_path: Path, waiting: Waiting, mode: str) -> None:
-    """In real time the run goes on; in lockstep messages are lost with their links."""
+    """In real time the run goes on; in lockstep messages are lost with their links, unless all of
+    these find a sign of life first when they wake."""
     log = tmp_path / "drive.mcap"
     drive = waiting.drive(log, "--mode", mode)
-    everybody = drive, waiting.plant, waiting.controller
+    everybody = {drive, waiting.plant, waiting.controller, waiting.bridge}
     for process in everybody:
         process.send_signal(signal.SIGSTOP)
     time.sleep(9.0)  # longer than links live without a sign of life
     for process in everybody:
         process.send_signal(signal.SIGCONT)
     if mode == "lockstep":
+        until(lambda: drive.poll() is not None or driven_after_a_pause(log), "an end, or driving")
+        if lives := drive.poll() is None:
+            drive.send_signal(signal.SIGINT)
         done = finish(drive)
-        assert done.returncode == 2
+        assert lives or done.returncode == 2
         assert "did not run for" in done.stderr
         assert "one in lockstep has to be started again" in done.stderr
         return
@@ -207,6 +237,7 @@ def test_a_suspended_machine_is_named(tmp_path: Path, waiting: Waiting, mode: st
     assert max(b.time_s - a.time_s for a, b in pairwise(states)) < 2.0
 
 
+@BOTH
 @pytest.mark.check
 @pytest.mark.wall_clock
 def test_a_run_in_which_the_car_was_not_driven_is_no_success(

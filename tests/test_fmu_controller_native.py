@@ -12,7 +12,7 @@ from bayesrace.codegen import host_files
 from bayesrace.codegen.build import HOST
 from bayesrace.codegen.build import NATIVE as HEADERS
 from bayesrace.codegen.host_files import PATH_FILE, WEIGHTS_FILE, path_file, weights_file
-from bayesrace.controller import assembly, native_step
+from bayesrace.controller import native_step
 from bayesrace.controller.native_step import Status
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import Weights
@@ -26,7 +26,6 @@ from tests.native_programs import PROGRAMS, SANITIZED, native_program
     ("macro", "values"),
     [
         ("BR_PATH_COLUMNS", {native_step.PATH_COLUMNS, host_files.PATH_COLUMNS}),
-        ("BR_PATH_CAPACITY", {assembly.CAPACITY, host_files.PATH_CAPACITY}),
     ],
 )
 def test_sizes_and_limits_of_the_native_step_are_those_that_python_states(
@@ -56,11 +55,11 @@ def loader(tmp_path_factory: pytest.TempPathFactory, kinematic_artefact: Path) -
 
 
 @pytest.fixture(scope="module")
-def good(circuit: Circuit, weights: Weights) -> tuple[bytes, bytes]:
+def good(circuit: Circuit, weights: Weights, kinematic_artefact: Path) -> tuple[bytes, bytes]:
     """Both files, small."""
     rows = circuit.table.rows[::16]
     identity = weights.discretisation
-    path = path_file(rows, circuit.table.spacing_m * 16)
+    path = path_file(rows, circuit.table.spacing_m * 16, read_manifest(kinematic_artefact))
     return path, weights_file(weights, identity, 1024)
 
 
@@ -136,6 +135,7 @@ def test_files_are_loaded_or_refused_and_never_read_beyond_their_end(
         "-1 path.bin is cut off or too long",
         "-1 path.bin is damaged (checksum)",
         "-1 path.bin has an impossible length",
+        "-1 path.bin is longer than this controller has room for",
         "-1 weights.bin has an unknown kernel",
         "-1 weights.bin has more training points than this controller has room for",
         "-1 weights.bin GP weights are unusable",
@@ -157,12 +157,13 @@ def test_missing_files_and_weights_of_another_model_are_named(
 def test_what_cannot_be_loaded_is_not_written(
     circuit: Circuit, weights: Weights, kinematic_artefact: Path
 ) -> None:
-    identity = read_manifest(kinematic_artefact).discretisation
+    manifest = read_manifest(kinematic_artefact)
+    identity = manifest.discretisation
     with pytest.raises(InputError, match="learned for"):
         weights_file(weights, "another", 1024)
     with pytest.raises(InputError, match="train with fewer points"):
         weights_file(weights, identity, 100)
     with pytest.raises(InputError, match="path table"):
-        path_file(circuit.table.rows[:, :6], 0.005)
+        path_file(circuit.table.rows[:, :6], 0.005, manifest)
     with pytest.raises(InputError, match="not finite"):
-        path_file(circuit.table.rows * np.nan, 0.005)
+        path_file(circuit.table.rows * np.nan, 0.005, manifest)

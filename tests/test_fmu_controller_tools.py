@@ -20,6 +20,7 @@ from bayesrace.codegen.fmu.build import sources_of, write_sources
 from bayesrace.codegen.host_files import WEIGHTS_FILE, path_file
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import zero_weights
+from bayesrace.manifest import read_manifest
 from tests.car_fmu import packed_car
 from tests.conftest import fit_weights
 from tests.fmu_lockstep import (  # noqa: F401 - a fixture is used by name
@@ -228,4 +229,5 @@ def test_what_does_not_fit_together_is_not_exported(exported: Exported) -> None:
         exported.define(rows=exported.circuit.table.rows[:4])
     with pytest.raises(InputError, match="export it there"):
         pack(exported.define(), exported.folder / "no.fmu", ["x86_64-linux", "x86_64-windows"])
-    assert len(path_file(exported.circuit.table.rows, exported.circuit.table.spacing_m)) % 8 == 0
+    table, manifest = exported.circuit.table, read_manifest(exported.artefact)
+    assert len(path_file(table.rows, table.spacing_m, manifest)) % 8 == 0

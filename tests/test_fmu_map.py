@@ -16,7 +16,6 @@ from bayesrace.errors import InputError
 from bayesrace.operation.terminal.fmu_table import fmu_table
 from bayesrace.plant.fmu.inspection import (
     blank_map,
-    factor_of,
     inspect,
     is_settable,
     platforms,
@@ -24,6 +23,7 @@ from bayesrace.plant.fmu.inspection import (
     steps_s,
 )
 from bayesrace.plant.fmu.map import parse_map, read_map, wire
+from bayesrace.units import factor_of
 from tests.fmu_variables import OWN, description, given, own_fmu, taken, variable, write_fmu
 
 # -- the file -------------------------------------------------------------------------------------

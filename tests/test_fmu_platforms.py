@@ -14,13 +14,16 @@ import numpy as np
 import pytest
 from fmpy import extract
 
+from bayesrace.codegen.build import build
 from bayesrace.codegen.compiler import find_compiler
 from bayesrace.codegen.fmu import car_fmu, pack
 from bayesrace.codegen.fmu.build import FLAGS
 from bayesrace.codegen.platforms import get_platform, host_platform
+from bayesrace.codegen.settings import BuildSettings
 from bayesrace.errors import InputError
 from bayesrace.vehicles import Car
 from tests.car_fmu import Version, built_in, commands, driven, packed_car, slave, unpacked_car
+from tests.fmu_lockstep import Exported, exported_controllers  # noqa: F401 - a fixture
 from tests.fmu_master import Slave
 
 HERE = Path(__file__).parent
@@ -136,7 +139,7 @@ def emulator(platform: str) -> list[str]:
     return [command, *arguments]
 
 
-def drive_program(platform: str, sources: Path, program: Path) -> None:
+def drive_program(platform: str, sources: Path, program: Path, *flags: str) -> None:
     """tests/native/fmi3_drive.c for a platform."""
     target = get_platform(platform).zig
     assert target is not None
@@ -144,6 +147,7 @@ def drive_program(platform: str, sources: Path, program: Path) -> None:
     line = [sys.executable, "-m", "ziglang", "cc", "-target", target, "-s", "-g0", *FLAGS]
     line += [
         f"-I{sources}",
+        *flags,
         str(HERE / "native" / "fmi3_drive.c"),
         *([] if platform == WINDOWS else ["-ldl"]),
     ]
@@ -176,3 +180,26 @@ def test_on_other_platforms_the_same_binary_drives_alike(
     states = np.frombuffer(done.stdout).reshape(-1, 7)
     expected = built_in(car, [(d, rate) for d, rate in inputs])[:, :7]
     np.testing.assert_allclose(states, expected, rtol=0, atol=1e-12)
+
+
+@linux
+@pytest.mark.check
+@pytest.mark.timeout(1500)
+def test_the_controller_for_another_processor_drives_alike(
+    exported: Exported, daqp: Path, ziglang: None, tmp_path: Path
+) -> None:
+    """Of an artefact that has DAQP's C; here the same states are answered with CasADi's DAQP."""
+    under = emulator("aarch64-linux")
+    artefact, _ = build(BuildSettings(), daqp=daqp)
+    fmu = pack(exported.define(artefact=artefact), tmp_path / "c.fmu", ["aarch64-linux"])
+    unpacked = tmp_path / "3"
+    extract(str(fmu), unzipdir=str(unpacked))
+    program = tmp_path / "drive"
+    drive_program("aarch64-linux", unpacked / "sources", program, "-DCONTROLLER")
+    run = exported.lockstep().run(exported.circuit.start(v_mps=0.1), 200)
+    done = subprocess.run(
+        [*under, program, binary(unpacked, "aarch64-linux"), unpacked / "resources"],
+        input=np.array(run.x).tobytes(), capture_output=True, check=True,
+    )  # fmt: skip
+    answered = np.frombuffer(done.stdout).reshape(-1, 2)
+    np.testing.assert_allclose(answered, np.array(run.u), rtol=0, atol=1e-9)

@@ -3,24 +3,26 @@
 import contextlib
 import dataclasses
 import math
+import os
 import re
 import shutil
+import signal
 import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numpy as np
 import pytest
-from msgspec.structs import asdict, replace
+from msgspec.structs import replace
 
 from bayesrace import clock
 from bayesrace.codegen.build import HOST, NATIVE, PROGRAM, build
 from bayesrace.codegen.compiler import Compiler
-from bayesrace.codegen.daqp import VERSION
 from bayesrace.codegen.host_files import (
     HEAD,
     IDENTITY_BYTES,
@@ -31,12 +33,10 @@ from bayesrace.codegen.host_files import (
 from bayesrace.codegen.platforms import get_platform
 from bayesrace.codegen.settings import BuildSettings
 from bayesrace.controller import process
-from bayesrace.controller.assembly import PredictiveController
 from bayesrace.controller.driver import Level
-from bayesrace.controller.native_step import NativeStep, Status
+from bayesrace.controller.native_step import Status
 from bayesrace.errors import InputError
 from bayesrace.gp.weights import Weights
-from bayesrace.log import LogReader, LogWriter
 from bayesrace.manifest import read_manifest
 from bayesrace.messages import (
     ACTUATION,
@@ -47,66 +47,28 @@ from bayesrace.messages import (
     Actuation,
     BrakingPlan,
     Command,
+    FrameReader,
     Message,
+    Seal,
     State,
     Topic,
     datagrams_in,
     framed,
     from_datagram,
     to_datagram,
+    to_frame,
 )
-from bayesrace.operation.closed_loop import ClosedLoop
 from bayesrace.operation.host import HostProgram, write_program
 from bayesrace.transport import HEARTBEAT_S, NEWEST
-from bayesrace.vehicles import Car
 from tests import sample_messages as messages
-from tests.conftest import SETTINGS, Circuit
+from tests.conftest import Circuit, Driven
+from tests.exchanged import without_clocks
 from tests.instruments import odometry, reading
 from tests.native_programs import SANITIZED, native_program
-from tests.shared import shared_folder
+from tests.network.cars import free_port, started_host
 from tests.test_fmu_controller_native import signed
 
 M = TypeVar("M", bound=Message)
-
-LAPS = 1
-CLOCKS = {
-    "source_time_ns", "released_ns", "received_ns", "decode_us", "solve_us", "encode_us",
-    "prepare_us", "wake_us",
-}  # fmt: skip
-"""Fields that say what a clock said."""
-
-
-@pytest.fixture(scope="module")
-def host(
-    tmp_path_factory: pytest.TempPathFactory, kinematic_artefact: Path, circuit: Circuit,
-    car: Car, weights: Weights,
-) -> HostProgram:  # fmt: skip
-    folder = tmp_path_factory.mktemp("host")
-    return HostProgram.made(
-        folder, kinematic_artefact, car, circuit.track, circuit.line, weights, SETTINGS
-    )
-
-
-Driven = Callable[..., LogReader]
-
-
-@pytest.fixture
-def driven(native: NativeStep, circuit: Circuit, car: Car, tmp_path: Path) -> Driven:
-    """The log of a lockstep drive with the controller in Python."""
-
-    def drive(max_time_s: float = 60.0, **given: Any) -> LogReader:
-        log = LogWriter(tmp_path / "log.mcap")
-        controller = PredictiveController(native)
-        loop = ClosedLoop(car, circuit.track, circuit.line, controller, log=log, **given)
-        loop.drive(LAPS, max_time_s=max_time_s)
-        log.close()
-        return LogReader(tmp_path / "log.mcap")
-
-    return drive
-
-
-def without_clocks(message: Message) -> dict[str, Any]:
-    return {name: value for name, value in asdict(message).items() if name not in CLOCKS}
 
 
 @pytest.mark.parametrize(
@@ -125,21 +87,6 @@ def test_a_recorded_drive_is_answered_to_the_bit(
         of_file = replace(expected[0], weights_version=weights.version)
         assert without_clocks(sent) == without_clocks(of_file)
         assert without_clocks(how) == without_clocks(expected[1])
-
-
-@pytest.fixture(scope="module")
-def daqp() -> Path:
-    """Its source distribution, of the package index."""
-    wanted = f"daqp=={VERSION}"
-
-    def download(folder: Path) -> None:
-        line = [sys.executable, "-m", "pip", "download", "-q", "--no-deps", "--no-binary", "daqp"]
-        subprocess.run([*line, wanted, "-d", folder], check=True, timeout=600)
-
-    try:
-        return next(shared_folder("daqp", [wanted], download).glob("daqp-*.tar.gz"))
-    except (subprocess.SubprocessError, StopIteration) as error:
-        pytest.skip(f"{wanted} cannot be downloaded: {error}")
 
 
 @pytest.mark.check
@@ -182,16 +129,14 @@ def plant(host: HostProgram, tmp_path: Path, request: pytest.FixtureRequest) -> 
     if request.param == "unix":
         own, there = str(tmp_path / "plant"), str(tmp_path / "host")
         family, link = socket.AF_UNIX, f"unix:{there}"
-    line = [str(host.folder / PROGRAM), str(host.folder), link, "--telemetry"]
-    with subprocess.Popen(line, stderr=subprocess.PIPE, text=True) as process:
-        assert process.stderr is not None
-        assert "ready" in process.stderr.readline()
+    with started_host(host, link) as process:
         with socket.socket(family, socket.SOCK_DGRAM) as one:
             one.settimeout(20.0)
             one.bind(own)
             one.connect(there)
             yield one, process
         process.terminate()
+        process.wait(20)
     assert process.returncode == 0
     assert not (tmp_path / "host").exists()
 
@@ -204,12 +149,6 @@ def another(plant: socket.socket, folder: Path) -> Iterator[socket.socket]:
         one.connect(plant.getpeername())
         one.settimeout(20.0)
         yield one
-
-
-def free_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
-        free.bind(("127.0.0.1", 0))
-        return int(free.getsockname()[1])
 
 
 def received(plant: socket.socket, topic: Topic[M]) -> M:
@@ -317,6 +256,21 @@ def test_another_plant_is_answered_once_the_first_is_silent(
         assert received(other, ACTUATION).epoch == 8
 
 
+@pytest.mark.parametrize("plant", ["udp"], indirect=True)
+def test_after_a_stall_the_newest_state_is_there(plant: Plant, circuit: Circuit) -> None:
+    """Of 0.6 s at 500 Hz; the system's default has room for half of them."""
+    one, process = plant
+    state = at_start(circuit)
+    one.send(to_datagram(STATE, state))
+    received(one, ACTUATION)
+    process.send_signal(signal.SIGSTOP)
+    for k in range(1, 300):
+        one.send(to_datagram(STATE, replace(state, seq=k, time_s=0.002 * k)))
+    process.send_signal(signal.SIGCONT)
+    while received(one, ACTUATION).state_seq != 299:
+        pass
+
+
 @pytest.mark.wall_clock
 def test_in_real_time_each_state_is_answered_and_a_braking_plan_sent_ahead(
     plant: Plant, driven: Driven
@@ -385,6 +339,67 @@ def test_a_stream_ends_with_a_signal_or_its_reader_and_the_counts_are_said(
         assert (b"unsent 1" if closes else b"states 0,") in said
 
 
+def test_with_a_key_the_same_is_answered_and_nothing_without_it(
+    host: HostProgram, circuit: Circuit, tmp_path: Path
+) -> None:
+    key, state = tmp_path / "key", at_start(circuit, lockstep=True)
+    key.write_bytes(bytes(32))
+    key.chmod(0o600)
+    line = [str(host.folder / PROGRAM), str(host.folder), "stdio", "--key", str(key)]
+    pipe = subprocess.PIPE
+    with subprocess.Popen(line, stdin=pipe, stdout=pipe, stderr=pipe) as process:
+        assert process.stderr is not None
+        assert b"ready" in process.stderr.readline()
+        seal, sent = Seal.read(key), to_datagram(STATE, state)
+        answers, said = process.communicate(framed(sent) + framed(seal.sealed(sent)), timeout=60)
+    (answer,) = map(seal.opened, datagrams_in(answers))
+    assert answer is not None
+    ((expected, _),) = host.answers([state])
+    assert without_clocks(from_datagram(answer)[1]) == without_clocks(expected)
+    assert b"states 1," in said
+    assert b"forged 1, replayed 0" in said
+
+
+def test_over_a_serial_line_a_drive_is_answered_as_over_a_stream(
+    host: HostProgram, driven: Driven
+) -> None:
+    """Datagrams are no longer than docs/host.md says, nor is the time that they take."""
+    *states, _ = driven(max_time_s=1.2).select(STATE)  # the last one ends the run
+    master, slave = os.openpty()
+    line = [str(host.folder / PROGRAM), str(host.folder), f"serial:{os.ttyname(slave)}"]
+    reader, came, longest = FrameReader(), list[bytes](), Counter[str]()
+
+    def next_of(topic: Topic[M]) -> M:
+        while True:
+            while not came:
+                came.extend(reader.take(os.read(master, 1 << 16)))
+            frame = to_frame(came[0])
+            found, message = from_datagram(came.pop(0))
+            longest[found.name] = max(longest[found.name], len(frame))
+            if found is topic:
+                return cast(M, message)
+
+    with subprocess.Popen([*line, "--telemetry"], stderr=subprocess.PIPE, text=True) as process:
+        assert process.stderr is not None
+        assert "ready" in process.stderr.readline()
+        os.close(slave)
+        try:
+            for state, expected in zip(states, host.answers(states), strict=True):
+                frame = to_frame(to_datagram(STATE, state))
+                longest["state"] = max(longest["state"], len(frame))
+                os.write(master, b"noise" * (state.seq % 3) + frame)
+                answered = next_of(ACTUATION), next_of(TELEMETRY)
+                assert list(map(without_clocks, answered)) == list(map(without_clocks, expected))
+        finally:
+            os.close(master)  # which ends it
+        said = process.stderr.read()
+        assert process.wait(20) == 0
+    assert len(states) >= 60
+    assert "unsent 0, bad frames 40," in said
+    for name, size in (("state", 240), ("actuation", 170), ("telemetry", 2500)):
+        assert 0.9 * size < longest[name] <= size
+
+
 def test_what_the_system_refuses_is_reported_and_the_program_goes_on(
     host: HostProgram, circuit: Circuit
 ) -> None:
@@ -432,7 +447,7 @@ def test_the_loop_in_c_has_the_same_times_as_the_one_in_python() -> None:
     [
         ((), "usage"),
         (("stdio",), "usage"),
-        (("DATA", "tcp:127.0.0.1:7450"), "no link; use udp:ADDRESS:PORT, unix:PATH or stdio"),
+        (("DATA", "tcp:127.0.0.1:7450"), "no link; use udp:ADDRESS:PORT, unix:PATH, serial:"),
         (("DATA", "udp:here"), "no address and port"),
         (("DATA", "udp:127.0.0.1:port"), "127.0.0.1:port: "),
         (("DATA", "unix:/nowhere/socket"), "/nowhere/socket: No such file"),
@@ -440,6 +455,8 @@ def test_the_loop_in_c_has_the_same_times_as_the_one_in_python() -> None:
         (("DATA", "stdio", "--rate"), "--rate: HZ"),
         (("DATA", "stdio", "--fifo", "80.5"), "--fifo: PRIORITY"),
         (("DATA", "stdio", "--fast"), "--fast: no such option"),
+        (("DATA", "stdio", "--key", "/nowhere"), "--key: /nowhere: No such file"),
+        (("DATA", "stdio", "--key"), "--key: FILE"),
         (("/nowhere", "stdio"), "/nowhere: path.bin is missing"),
     ],
 )

@@ -19,9 +19,12 @@ from bayesrace.messages import (
     ACTUATION,
     BRAKING,
     COMMAND,
+    RULING_ERRORS,
     STATE,
     TELEMETRY,
     TRUTH,
+    UPDATE,
+    UPDATED,
     WEIGHTS,
     Actuation,
     BrakingPlan,
@@ -29,6 +32,8 @@ from bayesrace.messages import (
     Message,
     Telemetry,
     Truth,
+    Update,
+    Updated,
     datagrams_in,
     framed,
     from_datagram,
@@ -47,7 +52,8 @@ LIMIT = 2**63 - 1
 def again(kinematic_artefact: Path, tmp_path_factory: pytest.TempPathFactory) -> Again:
     """Datagrams as C writes them again, under sanitizers; empty where it refuses one."""
     host, program = kinematic_artefact / HOST, tmp_path_factory.mktemp("wire") / "wire"
-    sources = (PROGRAMS / "wire.c", host / "br_wire.c", host / "br_transport.c")
+    links = [host / f"br_{part}.c" for part in ("transport", "serial", "seal", "hmac")]
+    sources = (PROGRAMS / "wire.c", host / "br_wire.c", *links)
     gcc("-O1", *SANITIZERS, *STRICT, f"-I{host}", *sources, "-lm", "-o", program)
 
     def run(sent: Sequence[bytes]) -> list[bytes]:
@@ -76,6 +82,8 @@ def samples() -> list[tuple[Any, Message]]:
         (ACTUATION, actuation),
         (ACTUATION, replace(actuation, weights_version="ü" * 100, u=(-1e3, 5e-324))),
         (COMMAND, Command(seq=1, source_time_ns=2, command="stop", text="a cone on the track")),
+        (UPDATE, blank(Update, action="write", at=7, data=bytes(range(256)) * 4)),
+        (UPDATED, blank(Updated, busy=True, data=b"", errors=(1e12,) * RULING_ERRORS)),
         (BRAKING, blank(BrakingPlan, step_s=0.02, d=(0.5, -0.1), delta=(0.0, 0.35))),
         (TELEMETRY, whole),
         (
@@ -107,7 +115,7 @@ def test_of_datagrams_that_are_damaged_both_refuse_the_same(again: Again) -> Non
     rng = random.Random(5)
     damaged = []
     for _ in range(6000):
-        topic, message = rng.choice(samples()[:8])
+        topic, message = rng.choice(samples()[:10])
         data = bytearray(to_datagram(topic, message))
         for _ in range(rng.choice((1, 1, 2, 5))):
             at = rng.randrange(len(data))

@@ -9,8 +9,11 @@ from msgspec.structs import replace
 from bayesrace.controller.driver import Level
 from bayesrace.plant.faults import READING_FAULTS
 from bayesrace.sensors import Sensors
+from tests.exchanged import Alike, answered_alike, racing_host
 from tests.instruments import FINE, ROUGH, Arriving, Seen, mocap, odometry, reading
 from tests.racing import Racing, racing
+
+__all__ = ["answered_alike", "racing_host"]  # fixtures
 
 BEGIN_S = 0.6
 SEED = 1
@@ -116,6 +119,19 @@ def test_a_wheel_or_gyro_that_fails_is_named_and_the_car_drives_on(
     assert set(driven.levels[10:]) == {Level.SOLUTION}
     counts = loop.driver.instruments[which]
     assert counts.refused + counts.lost + counts.left_out >= 5 or fault == "stopped"
+
+
+@pytest.mark.parametrize(("which", "fault"), [*(("pose", name) for name in POSE), *FAST])
+def test_the_controller_without_python_does_the_same(
+    race: Racing, answered_alike: Alike, which: str, fault: str
+) -> None:
+    if which == "pose":
+        test_a_pose_that_fails_is_named_and_the_car_stays_on_its_track(
+            race, fault, odometry(), 0.45
+        )
+    else:
+        test_a_wheel_or_gyro_that_fails_is_named_and_the_car_drives_on(race, which, fault, 0.45)
+    assert answered_alike() > 100
 
 
 @pytest.mark.parametrize(

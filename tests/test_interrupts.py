@@ -54,6 +54,29 @@ def test_an_interrupt_anywhere_is_one_interrupt(tmp_path: Path, how: str) -> Non
     assert (done.returncode, done.stdout, done.stderr) == (130, "", "")
 
 
+INTERRUPTED = """
+import threading, time
+from bayesrace.errors import {failure}
+from bayesrace.operation.cli import app
+from bayesrace.processes import interrupt
+
+def work(**_):
+    threading.Thread(target=interrupt, args=({failure}("certificate 'a' has expired"),)).start()
+    time.sleep(30)
+
+app.app = work
+app.main()
+"""
+
+
+@pytest.mark.parametrize(("failure", "code"), [("InputError", 2), ("RestartError", 75)])
+def test_a_process_that_interrupts_itself_says_why(failure: str, code: int) -> None:
+    """Wherever that strikes."""
+    program = [sys.executable, "-c", INTERRUPTED.format(failure=failure)]
+    done = subprocess.run(program, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (code, "bayesrace: certificate 'a' has expired\n")
+
+
 def test_signals_are_reported_and_do_nothing_else() -> None:
     caught = (signal.SIGINT, signal.SIGTERM)
     before = [signal.getsignal(one) for one in caught]

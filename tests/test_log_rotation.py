@@ -122,6 +122,24 @@ def test_a_reader_that_follows_misses_and_repeats_nothing(tmp_path: Path) -> Non
     assert log.deleted > 1
 
 
+def test_a_number_of_a_channel_is_another_key_in_the_next_part(tmp_path: Path) -> None:
+    """It stays so where reading goes on."""
+    path = tmp_path / "run.mcap"
+    with rotating(path) as log:
+        fill(log, 0, 1)
+        reader = LogReader(path)
+        while log.path == path:
+            log.write(KEY, encode(state(1)), time.monotonic_ns())
+            log.flush()
+        log.write("bayesrace/orca/unknown", b"junk", time.monotonic_ns())
+        log.flush()
+        assert list(reader.newer())
+        log.write("bayesrace/orca/unknown", b"junk", time.monotonic_ns())
+        log.flush()
+        assert not list(reader.newer())
+    assert reader.refused == 0
+
+
 def test_a_reader_that_falls_behind_goes_on_with_what_is_left(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     with rotating(path) as log:

@@ -4,6 +4,8 @@ import json
 import logging
 import math
 import random
+import subprocess
+import sys
 from typing import Any, Final
 
 import msgpack
@@ -22,6 +24,8 @@ from bayesrace.messages import (
     STATUS,
     STOP,
     TOPICS,
+    UPDATE,
+    UPDATED,
     CarSample,
     Decoder,
     Event,
@@ -37,6 +41,7 @@ from bayesrace.messages import (
     schema_version,
     to_json,
 )
+from tests.programs import ROOT
 
 KINDS: Final[tuple[type[Message], ...]] = tuple(
     dict.fromkeys(
@@ -175,7 +180,8 @@ def test_damaged_messages_decode_to_something_valid_or_are_refused(
 
 def test_every_kind_of_message_is_in_the_table() -> None:
     kinds = {k.__name__ for base in (Message, CarSample) for k in base.__subclasses__()}
-    assert {k.__name__ for k in KINDS} == kinds - {"CarSample"}
+    of_links = {one.message.__name__ for one in (UPDATE, UPDATED)}
+    assert {k.__name__ for k in KINDS} == kinds - {"CarSample"} - of_links
 
 
 def largest(form: inspect.Type, valid: Any) -> Any:
@@ -382,3 +388,33 @@ def test_telemetry_of_earlier_releases_is_read() -> None:
     old = decode(Telemetry, msgpack.packb(fields))
     assert [getattr(old, name) for name in later] == [-1, 0.0, (), -1.0, ()]
     assert old.plan_x == new.plan_x
+
+
+FIRST_USE = """
+import sys
+import threading
+from types import new_class
+from bayesrace.messages import State, decode, decode_json, encode, to_json
+from tests.test_messages import STATE as MESSAGE
+
+sys.setswitchinterval(1e-6)
+given = encode(MESSAGE), to_json(MESSAGE)
+for number in range(150):
+    fresh = new_class(f"Fresh{number}", (State,), {"frozen": True, "kw_only": True})
+    begin = threading.Barrier(4)
+    def use(read, data):
+        begin.wait()
+        read(fresh, data)
+    threads = [threading.Thread(target=use, args=one)
+               for one in zip((decode, decode_json) * 2, given * 2)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+"""
+
+
+def test_a_class_may_be_used_first_by_several_threads_at_once() -> None:
+    """Each of them would describe it to msgspec, whose other users crash meanwhile."""
+    done = subprocess.run([sys.executable, "-c", FIRST_USE], cwd=ROOT, capture_output=True)
+    assert (done.returncode, done.stderr) == (0, b"")

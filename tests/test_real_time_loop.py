@@ -266,7 +266,7 @@ def test_new_weights_come_after_both_cycles_of_a_release(
     history = SimpleNamespace(in_use=SimpleNamespace(proven=True))
     port: Any = SimpleNamespace(step=native, car=get_car("orca"), history=history)
     adoption = driven.process._adoption = Adoption(port, GateSettings())
-    task = Task(lambda: adoption.adopt("new", watched=False), 0)
+    task = Task(lambda: adoption.use("new", watched=False), 0)
     step = driven.law.step
 
     def offering(*arguments: Any) -> StepOutput:

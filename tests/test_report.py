@@ -15,7 +15,7 @@ from bayesrace.operation.report import render, write_report
 from bayesrace.operation.report.maps import lap_maps
 from bayesrace.operation.terminal.tables import COLUMNS
 from tests.command_line import Cli, refused
-from tests.synthetic_race import LAP_S, Drive, analyse, circle, write_race
+from tests.synthetic_race import Drive, analyse, circle, write_race
 from tests.test_analysis import TWO_LAPS, race
 
 
@@ -64,12 +64,11 @@ def rendered(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, RaceResult
 def test_the_page_needs_nothing_but_itself(rendered: tuple[Path, RaceResult]) -> None:
     text = rendered[0].read_text(encoding="utf-8")
     assert rendered[0].name == "report.html"
-    assert len(text) < 4_000_000
+    assert len(text) < 3_000_000
     assert not re.search(r"""(src|href)\s*=\s*["'](?!#|data:)""", text)
     assert not re.search(r"@import|url\(\s*[\"']?(?!#|data:)", text)
-    assert "script" not in parse(rendered[0]).tags
-    # Maps, time, speed, inputs, cornering, deviation, caution, GPs, execution times.
-    assert text.count("<svg ") == 4 + 2 + 2 + 3 + 2 + 2 + 3 + 6 + 1
+    # Cornering, GPs, execution times; the rest is drawn by the page's own scripts.
+    assert text.count("<svg ") - text.count('<svg class="mark"') == 1 + 6 + 1
     assert str(rendered[0].parent) not in text
 
 
@@ -161,30 +160,15 @@ def test_the_command_takes_a_directory_or_its_log_but_none_without_a_run(
 def test_names_from_files_are_text_not_markup(tmp_path: Path) -> None:
     drive = Drive("<script>alert(1)</script>", circle(TWO_LAPS, 1.0), ended="<b>over</b>")
     path = write_race(tmp_path, [drive])
-    tags = parse(write_report(path)).tags
-    assert "script" not in tags
-
-
-def test_time_lost_along_the_track_is_known(tmp_path: Path) -> None:
-    """A car that is 1 % slower everywhere loses evenly."""
-    from bayesrace.operation.report.panels import first_laps, reference_of
-
-    drives = [
-        Drive("bayesrace", circle(TWO_LAPS / 1.01, 1.0)),
-        Drive("bestcase", circle(TWO_LAPS, 1.0)),
-    ]
-    analysis = read_race(write_race(tmp_path, drives))
-    slower, best = first_laps(analysis.runs, analysis.track)
-    assert reference_of([slower, best]) is best
-    s, behind_s = slower.behind(best)
-    expected_s = 0.01 * LAP_S * s / analysis.track.length_m
-    np.testing.assert_allclose(behind_s, expected_s, atol=2e-4)
+    text = write_report(path).read_text()
+    assert "<script>alert" not in text
+    assert "<b>over" not in text
 
 
 def test_nothing_but_tables_is_wider_than_a_telephone(rendered: tuple[Path, RaceResult]) -> None:
     text = rendered[0].read_text(encoding="utf-8")
     assert 'name="viewport" content="width=device-width' in text
-    assert not re.search(r"<svg [^>]*(width|height)=", text)
+    assert not re.search(r'<svg (?!class="mark")[^>]*(width|height)=', text)
     for table in re.finditer("<table", text):
         assert text[: table.start()].endswith('<div class="scroll">')
     widths = [float(box.split()[2]) for box in re.findall(r'viewBox="([^"]*)"', text)]

@@ -3,7 +3,7 @@
 Promises guarded: a controller started again takes over the car that its forerunner left; a plant
 started again is found by the controller that waits for it, and what was meant for its forerunner
 does not act on it; a connection that breaks, or a router that dies, is made again. Meanwhile the
-car brakes, and stays on its track.
+car brakes, and stays on its track. All of it with the controller in Python and the one without.
 """
 
 import logging
@@ -30,6 +30,7 @@ from bayesrace.transport import Endpoints, Publisher, free_endpoint, open_sessio
 from bayesrace.transport.relay import Relay
 from tests.car_fmu import packed_car
 from tests.network.cars import (
+    Bridged,
     Course,
     Program,
     gentle_course,
@@ -45,9 +46,15 @@ pytestmark = pytest.mark.wall_clock
 _log = logging.getLogger(__name__)
 
 
+@pytest.fixture(scope="module", params=["Python", "C"])
+def language(request: pytest.FixtureRequest) -> str:
+    """Of the controller."""
+    return str(request.param)
+
+
 @pytest.fixture(scope="module")
-def course(tmp_path_factory: pytest.TempPathFactory) -> Course:
-    return gentle_course(tmp_path_factory.mktemp("course"))
+def course(tmp_path_factory: pytest.TempPathFactory, language: str) -> Course:
+    return gentle_course(tmp_path_factory.mktemp("course"), language=language)
 
 
 @dataclass
@@ -140,12 +147,12 @@ def rig(tmp_path: Path, course: Course) -> Iterator[Rig]:
         yield made
 
 
-def test_a_controller_started_again_takes_over_the_car(tmp_path: Path) -> None:
+def test_a_controller_started_again_takes_over_the_car(tmp_path: Path, language: str) -> None:
     """A larger and faster course, so that the car still rolls a second after it began to brake.
 
     How long it really took is logged: ``pytest --log-cli-level=INFO``.
     """
-    course = gentle_course(tmp_path, speed_mps=2.0, scale=3.0)
+    course = gentle_course(tmp_path, speed_mps=2.0, scale=3.0, language=language)
     with rigged(tmp_path, course) as rig:
         _take_over(rig)
 
@@ -175,7 +182,7 @@ def _take_over(rig: Rig) -> None:
     assert plant_counters["planned"] + plant_counters["braked"] > 0
     assert plant_counters["refused"] == plant_counters["rejected"] == 0
     # It takes the car as it finds it.
-    assert counters["raised"] == counters["states_stale"] == counters["refused"] == 0
+    assert counters["raised"] == counters["refused"] == counters.get("states_stale", 0) == 0
     assert counters["solution"] > counters["ticks"] / 2
 
 
@@ -186,7 +193,8 @@ def _answers_since(state: State, seq: int) -> bool:
 
 
 @pytest.mark.check
-@pytest.mark.parametrize("fmu", [False, True])
+@pytest.mark.parametrize(("language", "fmu"), [("Python", False), ("Python", True), ("C", False)],
+                         indirect=["language"])  # fmt: skip
 def test_a_plant_started_again_is_found(rig: Rig, fmu: bool) -> None:
     options = ("--fmu", str(packed_car())) if fmu else ()
     controller, plant = rig.driving(*options)
@@ -207,10 +215,21 @@ def test_a_plant_started_again_is_found(rig: Rig, fmu: bool) -> None:
     until(lambda: rig.observer.status("controller")["phase"] == "driving", "it to drive again")
     status = rig.observer.status("controller")
     assert status["epoch"] == rig.state().epoch
-    assert status["counters"]["states_stale"] == 0
+    assert status["counters"].get("states_stale", 0) == 0
     journey = rig.finished(controller, plant)
     assert {state.run for state in journey.states} == {1}
     assert {state.epoch for state in journey.states} == {before.epoch, status["epoch"]}
+
+
+@pytest.mark.check
+@pytest.mark.parametrize("language", ["C"], indirect=True)
+def test_a_program_started_again_takes_over_through_its_bridge(rig: Rig) -> None:
+    controller, plant = rig.driving()
+    assert isinstance(controller, Bridged)
+    controller.restart()
+    rig.drive_on()
+    until(lambda: rig.observer.status("controller")["phase"] == "driving", "it to drive")
+    rig.finished(controller, plant)
 
 
 def test_foreign_states_are_counted_and_the_car_drives_on(rig: Rig) -> None:

@@ -20,7 +20,10 @@ from bayesrace.operation.closed_loop import ClosedLoop, Driven, built_in_car
 from bayesrace.plant.car import End
 from bayesrace.plant.faults import STATE_FAULTS, StateFault
 from bayesrace.vehicles import get_car
+from tests.exchanged import Alike, answered_alike, racing_host
 from tests.racing import Racing, racing
+
+__all__ = ["answered_alike", "racing_host"]  # fixtures
 
 STEP_S = 0.02
 BEGIN_S = 0.6
@@ -103,6 +106,14 @@ def test_a_fault_is_noticed_and_the_car_stays_on_its_track(
     else:
         assert abs(driven.x[-1, 3]) < 0.05
         assert driven.levels[-1] == Level.STOP
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_the_controller_without_python_does_the_same(
+    race: Racing, answered_alike: Alike, name: str
+) -> None:
+    test_a_fault_is_noticed_and_the_car_stays_on_its_track(race, name, 0.45)
+    assert answered_alike() > 100
 
 
 def test_a_car_that_has_stopped_drives_on_when_it_is_told_to(race: Racing) -> None:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from bayesrace.api.values import State
 from bayesrace.arrays import Floats
+from bayesrace.operation.look import look
 from bayesrace.operation.report.maps import draw_edges, show_all
 from bayesrace.operation.report.style import (
     INK,
@@ -20,7 +21,6 @@ from bayesrace.operation.report.style import (
     PICTURE_WIDTH,
     WARNING,
     figure_style,
-    look,
     speed_map,
 )
 from bayesrace.tracks import Track

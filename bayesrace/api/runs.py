@@ -18,6 +18,7 @@ from bayesrace.messages import QUANTITIES, SENSOR_FAULTS
 from bayesrace.operation.analysis.laps import LapTimes
 from bayesrace.operation.closed_loop import ClosedLoop, Driven
 from bayesrace.raceline import RaceLine, same_track
+from bayesrace.scene import Scene
 from bayesrace.sensors import EXACT
 from bayesrace.tracks import Track
 from bayesrace.vehicles import Car, car_text
@@ -65,7 +66,10 @@ def drive(
     about = {"drive": {"car": car_text(car), "track": track.name}}
     with ExitStack() as opened:
         opened.callback(controller.reset)
-        writer = None if log is None else opened.enter_context(closing(LogWriter(Path(log), about)))
+        writer = None
+        if log is not None:
+            scene = Scene(car, track, controller.line)
+            writer = opened.enter_context(closing(LogWriter(Path(log), about, scene)))
         loop = ClosedLoop(
             car, track, controller.line, controller._predictive, vehicle, writer,
             controller._cycle_settings, **disturbed,

@@ -18,6 +18,7 @@ from bayesrace.operation.settings import RaceSettings, TimeMode
 from bayesrace.operation.system import private_network, started_system
 from bayesrace.raceline import RaceLine, write_raceline
 from bayesrace.recorder import Recorder
+from bayesrace.scene import Scene
 from bayesrace.sensors import Sensors
 from bayesrace.testing import RECORDING, SystemRun
 from bayesrace.tracks import Track, write_track
@@ -91,7 +92,10 @@ def drive_system(
                 # what others start need not know of links without priorities
                 lockstep=plan.lockstep and not own, own=own,
             ) as system,
-            Recorder(system.recording, driver.car.name, folder / RECORDING, about) as recorder,
+            Recorder(
+                system.recording, driver.car.name, folder / RECORDING, about,
+                scene=Scene(driver.car, driver.track, driver.line),
+            ) as recorder,
             system.controller(options),
         ):  # fmt: skip
             end = system.drive(driver.track, plan, recorder)

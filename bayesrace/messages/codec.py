@@ -7,6 +7,7 @@ integer where a float belongs; of a field that occurs twice, the last counts.
 """
 
 import logging
+import threading
 import time
 from collections.abc import Callable
 from functools import cache
@@ -51,9 +52,15 @@ def encode(message: Message) -> bytes:
     return _encode(message)
 
 
+_preparing: Final = threading.Lock()
+"""msgspec 0.22 describes a class to itself at its first use. A thread that uses the class meanwhile
+reads what is not there yet, and the process ends."""
+
+
 @cache
 def _reader(kind: type[Message]) -> Callable[[bytes], Any]:
-    return msgspec.msgpack.Decoder(kind, strict=True).decode
+    with _preparing:
+        return msgspec.msgpack.Decoder(kind, strict=True).decode
 
 
 def decode(kind: type[M], data: bytes) -> M:
@@ -106,7 +113,7 @@ class Decoder(Generic[M]):
     def __call__(self, data: bytes) -> M | None:
         """The message, or None if it was refused."""
         try:
-            message = decode(self._kind, data)
+            message = self._decoded(data)
         except InputError as error:
             self.refused += 1
             self.last_reason = str(error)
@@ -115,6 +122,9 @@ class Decoder(Generic[M]):
             return None
         self.accepted += 1
         return message
+
+    def _decoded(self, data: bytes) -> M:
+        return decode(self._kind, data)
 
     def report(self, logger: logging.Logger) -> None:
         """Log what was refused since the last report, unless that was just now."""
@@ -148,6 +158,7 @@ def to_json(message: Message) -> bytes:
 
 def decode_json(kind: type[M], data: bytes) -> M:
     """The message of class ``kind`` whose JSON is ``data``, checked as :func:`decode` checks."""
+    _reader(kind)
     try:
         content = _decode_json(data)
         for field, names, rows in _named(kind):

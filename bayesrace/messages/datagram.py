@@ -1,4 +1,4 @@
-"""Messages as datagrams, for links that have no keys: an array of a topic's name and the message.
+"""Messages as datagrams: an array of a topic's name and the message.
 
 So speak the controller in C (controller/host/br_wire.h) and what is connected to it. In a stream
 each datagram follows its length (u32, big-endian).
@@ -12,23 +12,24 @@ import msgspec
 
 from bayesrace.errors import InputError
 from bayesrace.messages.codec import LARGEST_BYTES, decode, encode
+from bayesrace.messages.link import UPDATE, UPDATED, LinkTopic
 from bayesrace.messages.table import SERVICES, TOPICS, Service, Topic
 from bayesrace.messages.types import Message
 
 __all__ = ["datagrams_in", "framed", "from_datagram", "head_of", "message_of", "to_datagram"]
 
-Named = Topic[Any] | Service[Any, Any]
+Named = Topic[Any] | Service[Any, Any] | LinkTopic
 
 _PAIR: Final = b"\x92"
 _LENGTH: Final = struct.Struct(">I")
-_ROWS: Final[tuple[Named, ...]] = (*SERVICES, *TOPICS)
+_ROWS: Final[tuple[Named, ...]] = (*SERVICES, *TOPICS, UPDATE, UPDATED)
 _NAMED: Final = {one.name: one for one in _ROWS}
 _read: Final = msgspec.msgpack.Decoder(tuple[str, msgspec.Raw]).decode
 
 
 def message_of(named: Named) -> type[Message]:
     """The class of a topic's messages, or of a service's requests."""
-    kind = named.message if isinstance(named, Topic) else named.request
+    kind = named.request if isinstance(named, Service) else named.message
     if kind is None:
         raise InputError(f"'{named.name}' is a file, no message")
     return kind

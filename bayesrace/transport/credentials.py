@@ -6,8 +6,6 @@ A folder holds what one process needs, as ``bayesrace certs`` writes it: the aut
 authority has signed and numbered that list; one with a lower number than the last is refused.
 """
 
-import os
-import stat
 import time
 from contextlib import suppress
 from pathlib import Path
@@ -16,7 +14,7 @@ from typing import TYPE_CHECKING, Final, Self
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from bayesrace.errors import InputError, TransientError, faults_in
-from bayesrace.files import read_text, write_whole
+from bayesrace.files import check_private, read_text, write_whole
 from bayesrace.messages import Role
 
 if TYPE_CHECKING:
@@ -25,7 +23,6 @@ if TYPE_CHECKING:
 __all__ = [
     "AUTHORITY", "CERTIFICATE", "CERTIFICATE_EXPIRED", "CERTIFICATE_NOT_YET", "COVERS", "EVERY_CAR",
     "KEY", "MEMBERS", "NEWEST_LIST", "Credentials", "Member", "Members", "calendar",
-    "check_private",
 ]  # fmt: skip
 
 AUTHORITY: Final = "ca.pem"
@@ -238,14 +235,6 @@ def _check_signature(members: Members, folder: Path) -> None:
             "'bayesrace certs' wrote it; if that is from before lists were signed, 'bayesrace "
             "certs add NAME --renew' for any name writes it again"
         ) from None
-
-
-def check_private(key: Path) -> None:
-    """InputError if others can read the key: theirs may be a group, where root owns the file."""
-    status = key.stat()
-    forbidden = 0o077 if status.st_uid else 0o027
-    if stat.S_IMODE(status.st_mode) & (forbidden if os.geteuid() else 0o077):
-        raise InputError(f"others can read the private key {key}: chmod 600 {key}")
 
 
 def calendar(time_s: float | None = None) -> str:

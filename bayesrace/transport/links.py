@@ -7,7 +7,6 @@ each new link is looked at before anything is received over it, and all are when
 
 import logging
 import math
-import signal
 import socket
 import struct
 import threading
@@ -22,6 +21,7 @@ import zenoh
 
 from bayesrace.errors import InputError
 from bayesrace.messages import Role
+from bayesrace.processes import interrupt
 from bayesrace.transport.credentials import (
     AUTHORITY,
     CERTIFICATE,
@@ -112,7 +112,11 @@ class Links:
             if over.wait(min(left_s, _LOOK_S)):
                 return ""
             self.look()
-        return self.used.expired() if self.used else ""
+        return self.expired()
+
+    def expired(self) -> str:
+        """What to say if the certificate in use has expired; else empty."""
+        return self.used.expired() if self.used and self.used.ends_s <= time.time() else ""
 
     def clear(self) -> None:
         """The session, and so all links, have ended."""
@@ -210,10 +214,12 @@ def watching(links: Links, failure: type[InputError] = InputError) -> Iterator[N
     """For the block, a thread looks at the folder once a second.
 
     The expiry of the certificate in use interrupts the main thread; then the end of the block
-    raises ``failure`` with the reason. Zenoh closes such links, but opens them again.
+    raises ``failure`` with the reason, which the command line also says where the interrupt
+    strikes outside of the block, as while a session is opened. Zenoh closes such links, but opens
+    them again.
 
-    Started in another thread, it only logs the reason. The log warns of the expiry each day for two
-    weeks before.
+    In a thread other than the main one it interrupts nothing, and logs the reason instead. The log
+    warns of the expiry each day for two weeks before.
     """
     in_main = threading.current_thread() is threading.main_thread()
     if in_main and _interrupting.locked():
@@ -227,8 +233,7 @@ def watching(links: Links, failure: type[InputError] = InputError) -> Iterator[N
         if not in_main:
             _log.error("%s", reason)
         elif _interrupting.acquire(blocking=False):
-            # Not to the process: another thread would get it, and the main one would sleep on.
-            signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
+            interrupt(failure(reason))
 
     thread = threading.Thread(target=wait, name="expiry", daemon=True)
     thread.start()
@@ -239,8 +244,9 @@ def watching(links: Links, failure: type[InputError] = InputError) -> Iterator[N
             over.set()
             thread.join()
     except (InputError, KeyboardInterrupt) as error:
-        if reasons:
-            raise failure(reasons[0]) from error
+        # Looked at once more: on a busy machine the closed links may be noticed before the expiry.
+        if reason := (reasons or [links.expired()])[0]:
+            raise failure(reason) from error
         raise
     if reasons:
         raise failure(reasons[0])

@@ -17,9 +17,9 @@ from typing import Final, NamedTuple
 
 from bayesrace.transport.endpoints import address_of, free_endpoint
 
-__all__ = ["AGAIN", "IDEAL", "Link", "Relay", "Way"]
+__all__ = ["IDEAL", "Link", "Relay", "Way"]
 
-AGAIN: Final = 4
+_AGAIN: Final = 4
 """After so many times the delay, two round trips, TCP sends again what was lost."""
 _DATAGRAM: Final = 1 << 16
 
@@ -65,7 +65,7 @@ class Way:
         """Time on the way, at least 0; of one that was ``lost`` until it has come once more."""
         link = self.link
         way_s = link.delay_s + self._chance.uniform(-link.jitter_s, link.jitter_s)
-        return max(way_s + (AGAIN * link.delay_s if lost else 0.0), 0.0)
+        return max(way_s + (_AGAIN * link.delay_s if lost else 0.0), 0.0)
 
 
 class _RelayedWay(Way):

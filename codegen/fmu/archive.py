@@ -1,7 +1,7 @@
 """The FMU file: descriptions, sources that rebuild it, binaries, documentation, licences.
 
 The texts are those of the templates beside this module: the model description of FMI 2.0 and 3.0,
-the build description of FMI 3.0, the page of documentation.
+the build description of FMI 3.0, the page of documentation; those of an SSP are rendered alike.
 """
 
 import re
@@ -33,7 +33,10 @@ from bayesrace.errors import InputError
 from bayesrace.files import replacing
 from bayesrace.gp.weights import Weights
 
-__all__ = ["exchange_weights", "licence_files", "pack", "third_parties"]
+__all__ = [
+    "base_units", "exchange_weights", "licence_files", "pack", "rendered", "third_parties",
+    "write_archive",
+]  # fmt: skip
 
 _LARGEST: Final = 1 << 30
 _TYPES: Final = {
@@ -122,25 +125,25 @@ def licence_files(parts: Sequence[Part]) -> dict[str, bytes]:
     return {f"documentation/licenses/{name}": text.encode() for name, text in texts.items()}
 
 
-def _rendered(template: str, definition: FmuDefinition, **values: Any) -> bytes:
+def rendered(template: str, **values: Any) -> bytes:
     """A template's text with these values, escaped as XML and HTML need it."""
     environment = Environment(
         loader=FileSystemLoader(Path(__file__).parent), autoescape=True,
         undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True,
     )  # fmt: skip
-    text = environment.get_template(f"{template}.j2").render(fmu=definition, **values)
+    text = environment.get_template(f"{template}.j2").render(**values)
     return f"{text}\n".encode()
 
 
 def _model_description(definition: FmuDefinition, token: str, linked: Sequence[str]) -> bytes:
     """``modelDescription.xml``; ``linked``: what the compiler is given."""
     units = sorted({v.unit for v in definition.all_variables if v.unit is not None})
-    return _rendered(
+    return rendered(
         "modelDescription.xml",
-        definition,
+        fmu=definition,
         token=token,
         files=[name for name in linked if name.endswith(".c")],
-        units={unit: _base_units(unit) for unit in units},
+        units={unit: base_units(unit) for unit in units},
         variables=[_described(definition, *one) for one in enumerate(definition.all_variables)],
         structure=_structure(definition),
     )
@@ -150,12 +153,12 @@ def _build_description(definition: FmuDefinition, linked: Sequence[str]) -> byte
     """``sources/buildDescription.xml`` of FMI 3.0."""
     files, libraries = ([name for name in linked if name.endswith(end)] for end in (".c", ".a"))
     flags = (*FLAGS, *definition.flags)
-    return _rendered(
-        "buildDescription.xml", definition, files=files, libraries=libraries, flags=flags
+    return rendered(
+        "buildDescription.xml", fmu=definition, files=files, libraries=libraries, flags=flags
     )
 
 
-def _base_units(unit: str) -> dict[str, int]:
+def base_units(unit: str) -> dict[str, int]:
     """Exponents of kg, m, s, rad in a unit like ``N.s2/m2``; InputError if it has others."""
     exponents = dict.fromkeys(("kg", "m", "rad", "s"), 0)
     for over, name, power in re.findall(r"(/?)([A-Za-z]+|1)([0-9]*)", unit):
@@ -222,8 +225,8 @@ def _page(definition: FmuDefinition, linked: Sequence[str], parts: Sequence[Part
     linux = PLATFORMS["x86_64-linux"]
     line = arguments(linux, linked, f"{definition.identifier}.so", definition.flags)
     folder = linux.folder(definition.version)
-    return _rendered(
-        "index.html", definition, line=shlex.join(["cc", *line]), folder=folder, parts=parts
+    return rendered(
+        "index.html", fmu=definition, line=shlex.join(["cc", *line]), folder=folder, parts=parts
     )
 
 
@@ -264,11 +267,11 @@ def pack(definition: FmuDefinition, out: Path, platforms: Sequence[str] | None =
             target.compiler().run(*line, folder=folder)
             place = f"binaries/{target.folder(definition.version)}/{binary.name}"
             contents[place] = binary.read_bytes()
-    _write(out, contents)
+    write_archive(out, contents)
     return out
 
 
-def _write(out: Path, contents: Mapping[str, bytes]) -> None:
+def write_archive(out: Path, contents: Mapping[str, bytes]) -> None:
     """The same contents give the same file: no entry has a time or the rights of this machine."""
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
@@ -279,7 +282,7 @@ def _write(out: Path, contents: Mapping[str, bytes]) -> None:
                 entry.create_system = 3
                 archive.writestr(entry, content, zipfile.ZIP_DEFLATED)
     except OSError as error:
-        raise InputError(f"cannot write the FMU to {out}: {error.strerror}") from None
+        raise InputError(f"cannot write {out}: {error.strerror}") from None
 
 
 def exchange_weights(fmu: Path, weights: Weights | None, out: Path) -> None:
@@ -304,4 +307,4 @@ def exchange_weights(fmu: Path, weights: Weights | None, out: Path) -> None:
         raise InputError(f"{fmu}: {name} is cut off; export the FMU again")
     capacity = HEAD.unpack_from(before)[4]
     identity = before[HEAD.size :][:IDENTITY_BYTES].rstrip(b"\0").decode("utf-8", "replace")
-    _write(out, contents | {name: weights_file(weights, identity, capacity)})
+    write_archive(out, contents | {name: weights_file(weights, identity, capacity)})

@@ -11,7 +11,7 @@ from typing import Any, Final, Literal
 
 from numpy.typing import ArrayLike
 
-from bayesrace.codegen.build import HOST
+from bayesrace.codegen.build import HOST, archives_of
 from bayesrace.codegen.compiler import FLAGS
 from bayesrace.codegen.fmu.build import NATIVE, FmuDefinition, Variable
 from bayesrace.codegen.fmu.car import STATE
@@ -108,7 +108,7 @@ def controller_fmu(
             **{name.upper(): brake[name] for name in ("brake_d", "brake_slow")},
         },
         resources={
-            PATH_FILE: path_file(rows, spacing_m),
+            PATH_FILE: path_file(rows, spacing_m, manifest),
             WEIGHTS_FILE: weights_file(weights, manifest.discretisation, manifest.gp_capacity),
         },
         documentation=_documentation(manifest, car, weights),
@@ -121,7 +121,7 @@ def _sources(artefact: Path, car: Car, *, nominal: bool) -> dict[str, bytes]:
     """Of the artefact all but its clock: without one there are no budgets; two runs are equal."""
     own = {*artefact.glob("*.[ch]"), *(artefact / HOST).glob("br_files.*")}
     own.remove(artefact / "br_clock.c")
-    files = {path.name: path for path in (NATIVE / "controller.c", *own, *artefact.glob("*.a"))}
+    files = {path.name: path for path in (NATIVE / "controller.c", *own, *archives_of(artefact))}
     files |= {f"daqp/{path.name}": path for path in (artefact / "daqp").iterdir()}
     planned = " ".join(f"X({name})" for name, *_ in _PLANNED)
     tables = reading_tables(car.sensors, car.tuning.estimation(nominal=nominal))

@@ -8,20 +8,15 @@
 
 #include "br_files.h"
 
-#define HEAD_BYTES 32
 #define SCHEMA 3
 #define LINE_BYTES 512
 #define WHOLE_MAX 1000000
-#define GP_HEAD_BYTES (2 * 4 + (4 + BR_NZ) * 8)
-#define PATH_BYTES_MAX (8 + (size_t)BR_PATH_CAPACITY * BR_PATH_COLUMNS * 8)
-#define WEIGHTS_BYTES_MAX                   \
-    (BR_IDENTITY_BYTES + BR_VERSION_BYTES + \
-     BR_NE * (GP_HEAD_BYTES + (size_t)BR_GP_CAPACITY * (BR_NZ + 1) * 8))
+#define WEIGHTS_MAGIC "BRFMGPWT"
+#define PATH_BYTES_MAX (BR_FILE_HEAD_BYTES + 8 + (size_t)BR_PATH_CAPACITY * BR_PATH_COLUMNS * 8)
 
 /* A file being read, and what is left of it. */
 typedef struct {
     const char *name;
-    unsigned char *data; /* owned */
     const unsigned char *at;
     size_t left;
     char *text; /* for the sentence that says what is wrong */
@@ -71,20 +66,25 @@ static FILE *opened(const char *folder, const char *name) {
     return file;
 }
 
-/* The whole file in memory, at most this long, head checked and passed. */
-static int open_file(reader *r, const char *folder, const char *magic, size_t body_max) {
-    const size_t most = HEAD_BYTES + body_max + 1;
-    r->data = malloc(most);
-    if (!r->data) return wrong(r, "does not fit into memory", "close other programs");
+/* The whole file into memory of its size at most, and one byte more. */
+static int read_file(reader *r, const char *folder, unsigned char *data, size_t most) {
+    if (!data) return wrong(r, "does not fit into memory", "close other programs");
     FILE *file = opened(folder, r->name);
     if (!file) return wrong(r, "is missing or cannot be read", ANEW);
-    const size_t size = fread(r->data, 1, most, file);
+    r->at = data;
+    r->left = fread(data, 1, most + 1, file);
     const int failed = ferror(file);
     fclose(file);
     if (failed) return wrong(r, "cannot be read", ANEW);
-    if (size < HEAD_BYTES || size == most) return wrong(r, "has an impossible length", ANEW);
-    r->at = r->data;
-    r->left = size;
+    if (r->left > most)
+        return wrong(r, "is longer than this controller has room for",
+                     "export it for this one, or build with more --path-rows or --gp-capacity");
+    return 0;
+}
+
+/* Checks the head, and passes it. */
+static int pass_head(reader *r, const char *magic) {
+    if (r->left < BR_FILE_HEAD_BYTES) return wrong(r, "has an impossible length", ANEW);
     if (memcmp(r->at, magic, 8)) return wrong(r, "is a file of another kind", ANEW);
     r->at += 8, r->left -= 8;
     if (read_integer(r, 4) != SCHEMA) return wrong(r, "has another schema", "export it again");
@@ -111,7 +111,7 @@ static int load_path(reader *r, br_mpc *mpc) {
 
 /* One output; its arrays follow each other in numbers. */
 static int load_output(reader *r, br_mpc_gp *gp, double *numbers) {
-    if (r->left < GP_HEAD_BYTES) return wrong(r, "is cut off", ANEW);
+    if (r->left < BR_GP_HEAD_BYTES) return wrong(r, "is cut off", ANEW);
     const uint64_t kernel = read_integer(r, 4), n = read_integer(r, 4);
     if (kernel > BR_KERNEL_MATERN25) return wrong(r, "has an unknown kernel", "train again");
     if (n > BR_GP_CAPACITY)
@@ -132,42 +132,54 @@ static int load_output(reader *r, br_mpc_gp *gp, double *numbers) {
     return 0;
 }
 
-static int load_weights(reader *r, br_mpc *mpc, const char *identity, char *version) {
+typedef br_mpc_error use(br_mpc *mpc, const br_mpc_gp outputs[BR_NE]);
+
+/* numbers: room for BR_WEIGHTS_NUMBERS; version: NULL, or where to put it. */
+static int take_weights(reader *r, br_mpc *mpc, use *loads, double *numbers, const char *identity,
+                        char *version) {
+    if (!numbers) return wrong(r, "does not fit into memory", "close other programs");
     if (r->left < BR_IDENTITY_BYTES + BR_VERSION_BYTES) return wrong(r, "is cut off", ANEW);
     if (strncmp((const char *)r->at, identity, BR_IDENTITY_BYTES))
         return wrong(r, "was learned for another model, car or time step",
                      "train with those of this controller");
     const char *named = (const char *)r->at + BR_IDENTITY_BYTES;
     if (!memchr(named, 0, BR_VERSION_BYTES)) return wrong(r, "has a version without end", ANEW);
-    if (version) memcpy(version, named, BR_VERSION_BYTES);
     r->at += BR_IDENTITY_BYTES + BR_VERSION_BYTES;
     r->left -= BR_IDENTITY_BYTES + BR_VERSION_BYTES;
-    const size_t each = BR_NZ + (size_t)BR_GP_CAPACITY * (BR_NZ + 1);
-    double *numbers = malloc(BR_NE * each * sizeof *numbers);
-    if (!numbers) return wrong(r, "does not fit into memory", "close other programs");
     br_mpc_gp outputs[BR_NE];
-    int failed = 0;
-    for (int j = 0; j < BR_NE && !failed; ++j)
-        failed = load_output(r, &outputs[j], numbers + (size_t)j * each);
-    if (!failed && r->left) failed = wrong(r, "is too long", ANEW);
-    if (!failed) {
-        const br_mpc_error error = br_mpc_set_weights(mpc, outputs);
-        if (error) failed = wrong(r, br_mpc_error_text(error), "train again");
-    }
-    free(numbers);
-    return failed;
+    for (size_t j = 0; j < BR_NE; ++j)
+        if (load_output(r, &outputs[j], numbers + j * (BR_WEIGHTS_NUMBERS / BR_NE))) return -1;
+    if (r->left) return wrong(r, "is too long", ANEW);
+    const br_mpc_error error = loads(mpc, outputs);
+    if (error) return wrong(r, br_mpc_error_text(error), "train again");
+    if (version) memcpy(version, named, BR_VERSION_BYTES);
+    return 0;
+}
+
+int br_files_stage(br_mpc *mpc, const unsigned char *file, size_t bytes, double *numbers,
+                   const char *identity, char version[BR_VERSION_BYTES], char *text, size_t size) {
+    reader r = {
+        .name = BR_FILE_WEIGHTS, .at = file, .left = bytes, .text = text, .text_size = size};
+    return pass_head(&r, WEIGHTS_MAGIC) ||
+                   take_weights(&r, mpc, br_mpc_stage_weights, numbers, identity, version)
+               ? -1
+               : 0;
 }
 
 int br_files_load(br_mpc *mpc, const char *folder, const char *identity,
                   char version[BR_VERSION_BYTES], char *text, size_t size) {
     reader path = {.name = BR_FILE_PATH, .text = text, .text_size = size};
     reader weights = {.name = BR_FILE_WEIGHTS, .text = text, .text_size = size};
-    int failed = open_file(&path, folder, "BRFMPATH", PATH_BYTES_MAX) || load_path(&path, mpc);
-    free(path.data);
-    if (failed) return -1;
-    failed = open_file(&weights, folder, "BRFMGPWT", WEIGHTS_BYTES_MAX) ||
-             load_weights(&weights, mpc, identity, version);
-    free(weights.data);
+    const size_t most = PATH_BYTES_MAX > BR_WEIGHTS_BYTES ? PATH_BYTES_MAX : BR_WEIGHTS_BYTES;
+    unsigned char *data = malloc(most + 1);
+    double *numbers = malloc(BR_WEIGHTS_NUMBERS * sizeof *numbers);
+    const int failed = read_file(&path, folder, data, PATH_BYTES_MAX) ||
+                       pass_head(&path, "BRFMPATH") || load_path(&path, mpc) ||
+                       read_file(&weights, folder, data, BR_WEIGHTS_BYTES) ||
+                       pass_head(&weights, WEIGHTS_MAGIC) ||
+                       take_weights(&weights, mpc, br_mpc_set_weights, numbers, identity, version);
+    free(numbers);
+    free(data);
     return failed ? -1 : 0;
 }
 
@@ -208,39 +220,62 @@ static int take_line(const reader *r, char *line, setting *settings, int count) 
     return 0;
 }
 
-int br_files_settings(const char *folder, br_mpc_parameters *parameters, br_driving *driving,
-                      br_estimation *estimation, char *text, size_t size) {
-    const reader r = {.name = BR_FILE_SETTINGS, .text = text, .text_size = size};
-    br_mpc_parameters *p = parameters;
-    br_driving *d = driving;
-#define OF_PARAMETERS(field) {.name = #field, .number = &p->field},
-#define COUNT_OF_PARAMETERS(field) {.name = #field, .whole = &p->field},
-#define OF_DRIVING(field) {.name = #field, .number = &d->field},
-#define COUNT_OF_DRIVING(field) {.name = #field, .whole = &d->field},
-    setting settings[] = {
-        BR_PARAMETERS(OF_PARAMETERS) BR_SOLVER_FIELDS(OF_PARAMETERS, COUNT_OF_PARAMETERS)
-            BR_DRIVING_FIELDS(OF_DRIVING, COUNT_OF_DRIVING){
-                .name = "start", .number = estimation->start, .count = BR_NB},
-        {.name = "drift", .number = estimation->drift, .count = BR_NB},
-        {.name = "acceleration", .number = estimation->acceleration, .count = BR_NE},
-        {.name = "acceleration_s", .number = &estimation->acceleration_s},
-        {.name = "yaw_lag_s", .number = &estimation->yaw_lag_s},
-        {.name = "understeer", .number = &estimation->understeer},
-        {.name = "gate", .number = &estimation->gate}};
-    const int count = sizeof settings / sizeof settings[0];
-    FILE *file = opened(folder, r.name);
-    if (!file) return wrong(&r, "is missing or cannot be read", ANEW);
+/* Every one of the settings, once at least. */
+static int read_settings(const reader *r, const char *folder, setting *settings, int count) {
+    FILE *file = opened(folder, r->name);
+    if (!file) return wrong(r, "is missing or cannot be read", ANEW);
     char line[LINE_BYTES];
     int failed = 0;
     while (!failed && fgets(line, sizeof line, file))
-        failed = strlen(line) + 1 < sizeof line ? take_line(&r, line, settings, count)
-                                                : wrong(&r, "has a line that is too long", line);
+        failed = strlen(line) + 1 < sizeof line ? take_line(r, line, settings, count)
+                                                : wrong(r, "has a line that is too long", line);
     fclose(file);
     for (int i = 0; i < count && !failed; ++i)
-        if (!settings[i].found) failed = wrong(&r, "lacks a line", settings[i].name);
+        if (!settings[i].found) failed = wrong(r, "lacks a line", settings[i].name);
+    return failed;
+}
+
+/* What follows from the settings that have been read. */
+static void derive(br_settings *to) {
+    const br_mpc_parameters *p = &to->parameters;
+    br_driving *d = &to->driving;
+    const br_estimation learned = to->with_weights;
+    to->with_weights = to->without_weights;
+    memcpy(to->with_weights.acceleration, learned.acceleration, sizeof learned.acceleration);
+    to->with_weights.acceleration_s = learned.acceleration_s;
     d->u_low[BR_INDEX_DUTY] = p->d_min;
     d->u_high[BR_INDEX_DUTY] = p->d_max;
     d->u_high[BR_INDEX_DELTA_RATE] = p->delta_rate_max_radps;
     d->u_low[BR_INDEX_DELTA_RATE] = -p->delta_rate_max_radps;
-    return failed;
+}
+
+int br_files_settings(const char *folder, br_settings *to, char *text, size_t size) {
+    const reader r = {.name = BR_FILE_SETTINGS, .text = text, .text_size = size};
+    br_mpc_parameters *p = &to->parameters;
+    br_driving *d = &to->driving;
+    br_mpc_probation *w = &to->probation;
+    br_estimation *estimation = &to->without_weights, *learned = &to->with_weights;
+#define OF_PARAMETERS(field) {.name = #field, .number = &p->field},
+#define COUNT_OF_PARAMETERS(field) {.name = #field, .whole = &p->field},
+#define OF_DRIVING(field) {.name = #field, .number = &d->field},
+#define COUNT_OF_DRIVING(field) {.name = #field, .whole = &d->field},
+#define OF_PROBATION(field) {.name = #field, .number = &w->field},
+#define COUNT_OF_PROBATION(field) {.name = #field, .whole = &w->field},
+    setting settings[] = {
+        BR_PARAMETERS(OF_PARAMETERS) BR_SOLVER_FIELDS(OF_PARAMETERS, COUNT_OF_PARAMETERS)
+            BR_DRIVING_FIELDS(OF_DRIVING, COUNT_OF_DRIVING)
+                BR_PROBATION_FIELDS(OF_PROBATION, COUNT_OF_PROBATION){
+                    .name = "resolution", .number = w->resolution, .count = BR_NE},
+        {.name = "start", .number = estimation->start, .count = BR_NB},
+        {.name = "drift", .number = estimation->drift, .count = BR_NB},
+        {.name = "acceleration", .number = estimation->acceleration, .count = BR_NE},
+        {.name = "acceleration_s", .number = &estimation->acceleration_s},
+        {.name = "learned_acceleration", .number = learned->acceleration, .count = BR_NE},
+        {.name = "learned_acceleration_s", .number = &learned->acceleration_s},
+        {.name = "yaw_lag_s", .number = &estimation->yaw_lag_s},
+        {.name = "understeer", .number = &estimation->understeer},
+        {.name = "gate", .number = &estimation->gate}};
+    if (read_settings(&r, folder, settings, sizeof settings / sizeof settings[0])) return -1;
+    derive(to);
+    return 0;
 }

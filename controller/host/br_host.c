@@ -1,5 +1,6 @@
 /* See br_host.h. */
 #define _GNU_SOURCE /* clock_nanosleep */
+#include <errno.h>
 #include <math.h>
 #include <stdio.h>
 #include <stdlib.h>
@@ -20,6 +21,13 @@
 #define BRAKING_NS 15000000 /* between two braking plans */
 #define NEWEST 1024         /* states that are looked through for the newest */
 
+/* Topic of a datagram, "" if it has none, and its message. */
+typedef struct {
+    char topic[32];
+    const uint8_t *data;
+    size_t size;
+} content;
+
 /* What has come of looking for a state. */
 typedef enum { NOTHING, NO_NEW_STATE, NEW_STATE } arrival;
 
@@ -28,19 +36,28 @@ typedef enum { NOTHING, NO_NEW_STATE, NEW_STATE } arrival;
 /* A block of memory as the controller wants it. */
 static void *block(size_t size) { return aligned_alloc(64, (size + 63) / 64 * 64); }
 
-static int failed(char *text, size_t size, const char *what, const char *why) {
-    snprintf(text, size, "%s: %s", what, why);
-    return -1;
+/* States are estimated by what the model of the weights in use is worth. */
+static br_mpc_error trust_model(br_host *host) {
+    const br_settings *settings = &host->settings;
+    host->by_weights = *host->update.in_use != 0;
+    if (!BR_HAS_ESTIMATOR) return BR_OK;
+    return br_cycle_set_estimation(
+        host->cycle, NULL, host->by_weights ? &settings->with_weights : &settings->without_weights);
 }
 
-static br_mpc_error make(br_host *host, const br_mpc_parameters *parameters,
-                         const br_driving *driving, const br_estimation *estimation) {
+static br_mpc_error make(br_host *host) {
     const size_t size = br_cycle_memory_size();
+    const br_settings *settings = &host->settings;
     void *memory = block(size);
-    br_mpc_error error = memory ? br_mpc_set_parameters(host->mpc, parameters) : BR_ERROR_MEMORY;
+    br_mpc_error error =
+        memory ? br_mpc_set_parameters(host->mpc, &settings->parameters) : BR_ERROR_MEMORY;
     if (!error) error = br_cycle_drive_mpc(memory, size, host->mpc, 0, &host->cycle);
-    if (!error) error = br_cycle_set_driving(host->cycle, driving);
-    if (!error) error = br_cycle_set_estimation(host->cycle, NULL, estimation);
+    if (!error) error = br_cycle_set_driving(host->cycle, &settings->driving);
+    if (!error && BR_HAS_ESTIMATOR) /* that both are valid is found now, not in a later run */
+        error = br_cycle_set_estimation(host->cycle, NULL, &settings->without_weights);
+    if (!error && BR_HAS_ESTIMATOR)
+        error = br_cycle_set_estimation(host->cycle, NULL, &settings->with_weights);
+    if (!error) error = trust_model(host);
     if (!error) error = br_cycle_set_clock(host->cycle, br_mpc_monotonic, NULL);
     return error;
 }
@@ -48,26 +65,30 @@ static br_mpc_error make(br_host *host, const br_mpc_parameters *parameters,
 int br_host_open(br_host *host, const char *folder, const char *link, double rate_hz, char *text,
                  size_t size) {
     char why[256];
-    br_mpc_parameters parameters;
-    br_driving driving;
-    br_estimation estimation;
+    char *version = host->update.in_use;
     const size_t memory = br_mpc_memory_size();
     br_mpc_error error = br_mpc_init(block(memory), memory, &host->mpc);
-    if (error) return failed(text, size, "controller", br_mpc_error_text(error));
-    if (br_files_load(host->mpc, folder, BR_MODEL_IDENTITY, host->weights, why, sizeof why) ||
-        br_files_settings(folder, &parameters, &driving, &estimation, why, sizeof why))
-        return failed(text, size, folder, why);
-    if (br_wire_characters(host->weights, strlen(host->weights)) < 0)
-        return failed(text, size, folder, "weights.bin has a version that is no text");
-    error = make(host, &parameters, &driving, &estimation);
-    if (error) return failed(text, size, folder, br_mpc_error_text(error));
+    if (error) return br_refused(text, size, "controller", br_mpc_error_text(error));
+    if (br_files_load(host->mpc, folder, BR_MODEL_IDENTITY, version, why, sizeof why) ||
+        br_files_settings(folder, &host->settings, why, sizeof why))
+        return br_refused(text, size, folder, why);
+    if (!br_update_is_version(version))
+        return br_refused(text, size, folder, "weights.bin has a version that is no text");
+    error = make(host);
+    if (error) return br_refused(text, size, folder, br_mpc_error_text(error));
     host->schedule.period_ns = llrint(1e9 / rate_hz);
     if (br_link_open(&host->link, link, &host->stopping, why, sizeof why))
-        return failed(text, size, "link", why);
+        return br_refused(text, size, "link", why);
+    if (br_update_open(&host->update, host->mpc, &host->settings)) {
+        br_refused(text, size, "new weights, by settings.txt and a thread", strerror(errno));
+        br_link_close(&host->link);
+        return -1;
+    }
     return 0;
 }
 
 void br_host_close(br_host *host) {
+    br_update_close(&host->update);
     br_link_close(&host->link);
     free(host->cycle);
     free(host->mpc);
@@ -121,6 +142,22 @@ static void measure(br_host *host, const br_state_message *state, br_instruments
     if (state->estimated) take_readings(host, state, known);
 }
 
+/* Speed in the newest state, measured or estimated; 0 where it is not known. */
+static double speed_mps(br_host *host) {
+    if (!host->state.estimated) return host->state.x[BR_INDEX_VX];
+    const int unknown = br_estimator_read(br_cycle_estimator(host->cycle), &host->belief);
+    return unknown ? 0 : host->belief.x[BR_INDEX_VX];
+}
+
+/* What the watch over new weights makes of a state. */
+static void observe_trial(br_host *host) {
+    const br_decision *before = &host->decision;
+    if (!host->update.on_trial || br_cycle_counters(host->cycle)->doubted) return;
+    const int undriven = before->status == BR_HALTED || before->status == BR_NO_STATE;
+    br_mpc_observe_trial(&host->update.trial, speed_mps(host),
+                         undriven ? -1 : before->level != BR_SOLUTION);
+}
+
 /* The cycle's verdict on a state; a new one is driven on, for its sender. */
 static arrival observe(br_host *host, const br_state_message *state, const br_address *from,
                        int64_t arrived_ns) {
@@ -143,6 +180,9 @@ static arrival observe(br_host *host, const br_state_message *state, const br_ad
     host->has_state = 1;
     host->timing.taken += 1;
     host->timing.arrived_ns = arrived_ns;
+    if (begins && state->estimated && host->by_weights != (*host->update.in_use != 0))
+        trust_model(host);
+    observe_trial(host);
     return NEW_STATE;
 }
 
@@ -155,24 +195,29 @@ static int from_other(const br_host *host) {
     return !br_same_address(&host->link.from, &host->link.peer);
 }
 
-/* Whether the datagram at hand is a message of that topic. */
-static int reads(const br_host *host, size_t size, const br_wire_table *table, void *message) {
-    char topic[32];
-    size_t payload;
-    const uint8_t *data = host->datagram;
-    const char *of = br_wire_topic(data, size, &payload, topic);
-    if (!of || strcmp(of, table->topic)) return 0;
-    return !br_wire_read(table, data + payload, size - payload, message);
+/* The datagram at hand. */
+static content content_of(const br_host *host, size_t size) {
+    content of = {.data = host->datagram};
+    size_t begin = size;
+    if (!br_wire_topic(host->datagram, size, &begin, of.topic)) of.topic[0] = 0;
+    of.data += begin;
+    of.size = size - begin;
+    return of;
 }
 
-static int reads_state(br_host *host, size_t size) {
-    return reads(host, size, &BR_STATE_TABLE, &host->incoming) &&
+/* Whether it is a message of that topic. */
+static int reads(const content *of, const br_wire_table *table, void *message) {
+    return !strcmp(of->topic, table->topic) && !br_wire_read(table, of->data, of->size, message);
+}
+
+static int reads_state(br_host *host, const content *of) {
+    return reads(of, &BR_STATE_TABLE, &host->incoming) &&
            host->incoming.actuation_delays_count % 3 == 0; /* whole rows */
 }
 
 /* Carries out a command to stop or go, from any sender; whether the datagram was one. */
-static int obeys(br_host *host, size_t size) {
-    if (!reads(host, size, &BR_COMMAND_TABLE, &host->command)) return 0;
+static int obeys(br_host *host, const content *of) {
+    if (!reads(of, &BR_COMMAND_TABLE, &host->command)) return 0;
     if (!strcmp(host->command.command, "stop"))
         br_cycle_stop(host->cycle);
     else
@@ -181,18 +226,36 @@ static int obeys(br_host *host, size_t size) {
     return 1;
 }
 
+/* Serves a request about weights; whether the datagram was one. */
+static int updates(br_host *host, const content *of) {
+    if (!reads(of, &BR_UPDATE_TABLE, &host->update.request)) return 0;
+    const int waits = host->has_state && host->state.lockstep;
+    host->asked_from = host->link.from;
+    host->timing.updates += 1;
+    if (br_update_serve(&host->update, br_next_cycle(&host->timing), waits)) br_send_updated(host);
+    return 1;
+}
+
+/* What is done about weights between two cycles, before the next one is prepared. */
+static void between_cycles(br_host *host) {
+    if (br_update_between(&host->update, br_next_cycle(&host->timing))) br_send_updated(host);
+}
+
 /* The next datagram, waited for until then. The end of the link ends the loop. */
 static arrival receive_state(br_host *host, int64_t until_ns) {
     const long size = br_link_receive(&host->link, until_ns, host->datagram, sizeof host->datagram);
-    host->stopping |= size == BR_LINK_ENDED;
+    if (size == BR_LINK_ENDED) host->stopping = 1;
+    if (size == BR_LINK_REFUSED) return NO_NEW_STATE;
     if (size < 0) return NOTHING;
     const int64_t arrived_ns = br_now_ns();
-    if (obeys(host, (size_t)size)) return NO_NEW_STATE;
+    const content of = content_of(host, (size_t)size);
+    if (obeys(host, &of)) return NO_NEW_STATE;
     if (from_other(host)) {
         host->timing.from_others += 1;
         return NO_NEW_STATE;
     }
-    if (!reads_state(host, (size_t)size)) {
+    if (updates(host, &of)) return NO_NEW_STATE;
+    if (!reads_state(host, &of)) {
         host->timing.refused += 1;
         return NO_NEW_STATE;
     }
@@ -214,6 +277,7 @@ static int end_run(br_host *host, int fresh) {
 }
 
 static int await_state(br_host *host) {
+    between_cycles(host);
     return receive_state(host, br_now_ns() + IDLE_NS) == NEW_STATE || take_unanswered(host);
 }
 
@@ -230,12 +294,17 @@ static int64_t budget_end_ns(const br_host *host) {
     return host->schedule.release_ns + part_ns(host, host->budget);
 }
 
+static br_environment limits(br_host *host) {
+    return br_update_limits(&host->update, host->update.limit_mps > 0 ? speed_mps(host) : 0);
+}
+
 /* Decides, and sends what it has decided. */
 static void cycle(br_host *host, double decided_at_s, double budget_s, double spent_s) {
     br_timing *timing = &host->timing;
     const int64_t begin_ns = br_now_ns();
+    const br_environment around = limits(host);
     const br_mpc_error error =
-        br_cycle_decide(host->cycle, NULL, decided_at_s, budget_s, spent_s, &host->decision);
+        br_cycle_decide(host->cycle, &around, decided_at_s, budget_s, spent_s, &host->decision);
     if (error) return; /* without a state there is none to answer */
     const int64_t decided_ns = br_now_ns();
     timing->solve_us = (double)(decided_ns - begin_ns) * 1e-3;
@@ -271,6 +340,7 @@ static int lockstep(br_host *host) {
         if (fresh) {
             timing->released_ns = br_now_ns();
             cycle(host, counters(host)->time_s, 0, 0);
+            between_cycles(host);
             prepare(host, counters(host)->interval_s, 0);
         }
         fresh = receive_state(host, br_now_ns() + IDLE_NS) == NEW_STATE;
@@ -314,6 +384,7 @@ static int newest_state(br_host *host, int64_t until_ns) {
     const int64_t run = host->state.run, epoch = host->state.epoch;
     int fresh = 0;
     for (int i = 0; i < NEWEST && !host->stopping; ++i) {
+        if (i && br_now_ns() > budget_end_ns(host)) break; /* a flood */
         const int waits = !fresh || missing(host) == 1;
         const arrival found = receive_state(host, waits ? until_ns : 0);
         if (found == NOTHING) break;
@@ -347,6 +418,7 @@ static void plan_braking(br_host *host) {
 }
 
 static void prepare_next(br_host *host) {
+    between_cycles(host);
     const int64_t pause_ns = smaller(part_ns(host, WAY), WAY_NS);
     if (budget_end_ns(host) - br_now_ns() > pause_ns) sleep_until(br_now_ns() + pause_ns);
     plan_braking(host);
@@ -359,7 +431,8 @@ static void prepare_next(br_host *host) {
 /* Uses what the cycle will use, without effect: message, cycle, message. */
 static void rehearse(br_host *host) {
     const size_t size = br_wire_write(&BR_STATE_TABLE, &host->state, host->datagram, BR_DATAGRAM);
-    reads_state(host, size);
+    const content of = content_of(host, size);
+    reads_state(host, &of);
     br_cycle_rehearse(host->cycle);
     br_wire_write(&BR_ACTUATION_TABLE, &host->actuation, host->datagram, BR_DATAGRAM);
 }

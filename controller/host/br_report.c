@@ -9,11 +9,19 @@
 #define LARGEST_MEASURE 1e12
 
 static void publish(br_host *host, const br_wire_table *table, const void *message) {
-    const size_t size = br_wire_write(table, message, host->datagram, sizeof host->datagram);
+    const size_t size = br_wire_write(table, message, host->datagram, BR_DATAGRAM);
     if (size)
         br_link_send(&host->link, host->datagram, size);
     else
         host->link.unsent += 1;
+}
+
+void br_send_updated(br_host *host) {
+    br_link *link = &host->link;
+    const br_address driven = link->peer;
+    link->peer = host->asked_from; /* before a run, the sender may not be the plant driven for */
+    publish(host, &BR_UPDATED_TABLE, &host->update.answer);
+    link->peer = driven;
 }
 
 void br_send_actuation(br_host *host) {
@@ -26,7 +34,7 @@ void br_send_actuation(br_host *host) {
     m->state_seq = host->state.seq;
     m->decided_at_s = decision->decided_at_s;
     memcpy(m->u, decision->u, sizeof m->u);
-    strcpy(m->weights_version, host->weights);
+    strcpy(m->weights_version, host->update.in_use);
     m->status = decision->status;
     publish(host, &BR_ACTUATION_TABLE, m);
     host->timing.encode_us = (double)(br_now_ns() - begin_ns) * 1e-3;
@@ -110,7 +118,8 @@ static void report_estimate(br_host *host, br_telemetry_message *m) {
 
 static void report_timing(br_host *host, br_telemetry_message *m) {
     br_timing *timing = &host->timing;
-    m->tick = timing->ticks++ + timing->skipped - timing->late_states;
+    m->tick = br_next_cycle(timing);
+    timing->ticks += 1;
     m->released_ns = timing->released_ns;
     m->received_ns = timing->arrived_ns;
     m->missed = timing->missed;

@@ -12,6 +12,7 @@
 #include "br_transport.h"
 
 #define NS_PER_S 1000000000
+#define WAITING_BYTES (1 << 20) /* of datagrams that wait: the newest of a stall are wanted */
 
 int64_t br_now_ns(void) {
     struct timespec now;
@@ -19,7 +20,7 @@ int64_t br_now_ns(void) {
     return (int64_t)now.tv_sec * NS_PER_S + now.tv_nsec;
 }
 
-static int refused(char *text, size_t size, const char *what, const char *why) {
+int br_refused(char *text, size_t size, const char *what, const char *why) {
     snprintf(text, size, "%s: %s", what, why);
     return -1;
 }
@@ -27,8 +28,11 @@ static int refused(char *text, size_t size, const char *what, const char *why) {
 /* --- datagrams --- */
 
 static int bound(br_link *link, int domain, const struct sockaddr *at, socklen_t length) {
+    const int waiting = WAITING_BYTES; /* or as many as the system grants */
     link->in = link->out = socket(domain, SOCK_DGRAM | SOCK_NONBLOCK | SOCK_CLOEXEC, 0);
-    return link->in < 0 ? -1 : bind(link->in, at, length);
+    if (link->in < 0) return -1;
+    setsockopt(link->in, SOL_SOCKET, SO_RCVBUF, &waiting, sizeof waiting);
+    return bind(link->in, at, length);
 }
 
 /* The address before the last colon, without the brackets of IPv6; -1: it is too long. */
@@ -45,15 +49,15 @@ static int open_udp(br_link *link, const char *where, char *text, size_t size) {
     const char *colon = strrchr(where, ':');
     char host[256];
     if (!colon || host_of(where, colon, host, sizeof host))
-        return refused(text, size, where, "no address and port, such as 127.0.0.1:7450");
+        return br_refused(text, size, where, "no address and port, such as 127.0.0.1:7450");
     const struct addrinfo wanted = {.ai_socktype = SOCK_DGRAM,
                                     .ai_flags = AI_NUMERICHOST | AI_NUMERICSERV};
     struct addrinfo *found;
     const int failed = getaddrinfo(host, colon + 1, &wanted, &found);
-    if (failed) return refused(text, size, where, gai_strerror(failed));
+    if (failed) return br_refused(text, size, where, gai_strerror(failed));
     const int unbound = bound(link, found->ai_family, found->ai_addr, found->ai_addrlen);
     freeaddrinfo(found);
-    return unbound ? refused(text, size, where, strerror(errno)) : 0;
+    return unbound ? br_refused(text, size, where, strerror(errno)) : 0;
 }
 
 /* Removes a socket file that a killed process has left, to which no process listens any more. */
@@ -71,12 +75,12 @@ static int open_unix(br_link *link, const char *where, char *text, size_t size) 
     struct sockaddr_un *at = &link->own;
     struct stat made;
     if (!*where || strlen(where) >= sizeof at->sun_path)
-        return refused(text, size, where, "no path of at most 107 bytes");
+        return br_refused(text, size, where, "no path of at most 107 bytes");
     at->sun_family = AF_UNIX;
     strcpy(at->sun_path, where);
     remove_left_over(at);
     if (bound(link, AF_UNIX, (const struct sockaddr *)at, sizeof *at) || lstat(where, &made))
-        return refused(text, size, where, strerror(errno));
+        return br_refused(text, size, where, strerror(errno));
     link->device = made.st_dev;
     link->inode = made.st_ino;
     return 0;
@@ -111,7 +115,7 @@ static void close_datagrams(br_link *link) {
 /* --- standard input and output --- */
 
 static int open_stdio(br_link *link, const char *where, char *text, size_t size) {
-    if (*where) return refused(text, size, "stdio", "nothing comes behind it");
+    if (*where) return br_refused(text, size, "stdio", "nothing comes behind it");
     link->in = STDIN_FILENO, link->out = STDOUT_FILENO;
     return 0;
 }
@@ -159,41 +163,51 @@ static void close_stream(br_link *link) { (void)link; }
 
 /* --- any --- */
 
-static const br_transport transports[] = {
-    {"udp", open_udp, receive_datagram, send_datagram, descriptor, close_datagrams},
-    {"unix", open_unix, receive_datagram, send_datagram, descriptor, close_datagrams},
-    {"stdio", open_stdio, receive_stream, send_stream, descriptor, close_stream}};
+static const br_transport udp = {"udp",         open_udp,   receive_datagram,
+                                 send_datagram, descriptor, close_datagrams};
+static const br_transport local = {"unix",        open_unix,  receive_datagram,
+                                   send_datagram, descriptor, close_datagrams};
+static const br_transport stdio = {"stdio",     open_stdio, receive_stream,
+                                   send_stream, descriptor, close_stream};
+static const br_transport *const transports[] = {&udp, &local, &stdio, &br_serial};
 
 int br_link_open(br_link *link, const char *name, const volatile sig_atomic_t *stopping, char *text,
                  size_t size) {
     const size_t length = strcspn(name, ":");
     for (size_t i = 0; i < sizeof transports / sizeof transports[0]; ++i) {
-        const br_transport *one = &transports[i];
+        const br_transport *one = transports[i];
         if (strlen(one->name) != length || strncmp(one->name, name, length)) continue;
         *link = (br_link){.by = one, .stopping = stopping};
         return one->open(link, name + length + (name[length] == ':'), text, size);
     }
-    return refused(text, size, name, "no link; use udp:ADDRESS:PORT, unix:PATH or stdio");
+    return br_refused(text, size, name,
+                      "no link; use udp:ADDRESS:PORT, unix:PATH, serial:DEVICE or stdio");
 }
 
 /* A descriptor may be readable and have nothing, as after a datagram with a bad checksum. */
 long br_link_receive(br_link *link, int64_t until_ns, uint8_t *data, size_t size) {
-    struct pollfd one = {.fd = link->by->descriptor(link), .events = POLLIN};
+    struct pollfd one = {.fd = link->by->descriptor(link)};
     for (;;) {
         int64_t left_ns = until_ns - br_now_ns();
         if (left_ns < 0) left_ns = 0;
         const struct timespec left = {.tv_sec = (time_t)(left_ns / NS_PER_S),
                                       .tv_nsec = (long)(left_ns % NS_PER_S)};
         if (link->broken) return BR_LINK_ENDED;
-        if (ppoll(&one, 1, &left, NULL) > 0) {
+        one.events = link->queued ? POLLIN | POLLOUT : POLLIN;
+        if (link->unread || ppoll(&one, 1, &left, NULL) > 0) {
             const long got = link->by->receive(link, data, size);
+            if (got >= 0 && link->seal) {
+                const long length = br_seal_open(link->seal, data, (size_t)got);
+                return length >= 0 ? length : BR_LINK_REFUSED;
+            }
             if (got != BR_LINK_NOTHING) return got;
         }
         if (!left_ns || *link->stopping) return BR_LINK_NOTHING;
     }
 }
 
-void br_link_send(br_link *link, const uint8_t *data, size_t size) {
+void br_link_send(br_link *link, uint8_t *data, size_t size) {
+    if (link->seal) size = br_seal_put(link->seal, data, size);
     link->unsent += link->by->send(link, data, size) != 0;
 }
 

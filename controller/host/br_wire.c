@@ -7,14 +7,14 @@
 
 /* --- items of MessagePack, one after the other --- */
 
-typedef enum { IS_WHOLE, IS_REAL, IS_FLAG, IS_TEXT, IS_ARRAY, IS_MAP } item_kind;
+typedef enum { IS_WHOLE, IS_REAL, IS_FLAG, IS_TEXT, IS_BYTES, IS_ARRAY, IS_MAP } item_kind;
 
 typedef struct {
     item_kind kind;
     int64_t whole; /* also of a flag */
     double real;
     size_t count;     /* bytes, items or pairs that follow */
-    const char *text; /* not terminated */
+    const char *text; /* or bytes; not terminated */
 } item;
 
 typedef struct {
@@ -82,6 +82,10 @@ static int read_head(reader *r, item *found) {
         found->kind = IS_FLAG;
         found->whole = head & 1;
         return 0;
+    case 0xc4:
+    case 0xc5:
+    case 0xc6:
+        return read_count(r, 1 << (head - 0xc4), IS_BYTES, found);
     case 0xca:
     case 0xcb:
         return read_real(r, head == 0xcb ? 8 : 4, found);
@@ -105,14 +109,14 @@ static int read_head(reader *r, item *found) {
     case 0xde:
     case 0xdf:
         return read_count(r, 2 << (head - 0xde), IS_MAP, found);
-    default: /* nil, bytes, extensions: no message has any */
+    default: /* nil, extensions: no message has any */
         return -1;
     }
 }
 
 static int read_item(reader *r, item_kind kind, item *found) {
     if (read_head(r, found) || found->kind != kind) return -1;
-    if (kind != IS_TEXT) return 0;
+    if (kind != IS_TEXT && kind != IS_BYTES) return 0;
     if ((size_t)(r->end - r->at) < found->count) return -1;
     found->text = (const char *)r->at;
     r->at += found->count;
@@ -190,6 +194,14 @@ static int take_text(reader *r, const br_wire_field *field, char *text) {
     return 0;
 }
 
+static int take_bytes(reader *r, const br_wire_field *field, char *message) {
+    item found;
+    if (read_item(r, IS_BYTES, &found) || found.count > (size_t)field->most) return -1;
+    memcpy(message + field->at, found.text, found.count);
+    *(int *)(message + field->count_at) = (int)found.count;
+    return 0;
+}
+
 static const br_wire_field deviation = {.low = BR_DEVIATION_LOW, .high = BR_DEVIATION_HIGH};
 
 static const char *const quantities[BR_QUANTITIES] = {BR_QUANTITY_NAMES};
@@ -249,6 +261,8 @@ static int take_field(reader *r, const br_wire_field *field, char *message) {
         return take_flag(r, (int *)at);
     case BR_TEXT:
         return take_text(r, field, at);
+    case BR_BYTES:
+        return take_bytes(r, field, message);
     case BR_MEASURES:
         return take_measures(r, field, (br_measures *)at);
     default:
@@ -330,18 +344,19 @@ static void put_count(writer *w, uint8_t few, unsigned most_few, uint8_t head, s
         put(w, head, count, 2);
 }
 
-static void put_text(writer *w, const char *text) {
-    const size_t length = strlen(text);
-    if (length < 32)
-        put(w, (uint8_t)(0xa0 | length), 0, 0);
-    else
-        put(w, 0xda, length, 2);
+static void put_bytes(writer *w, const void *bytes, size_t length) {
     if (w->failed || (size_t)(w->end - w->at) < length) {
         w->failed = 1;
         return;
     }
-    memcpy(w->at, text, length);
+    memcpy(w->at, bytes, length);
     w->at += length;
+}
+
+static void put_text(writer *w, const char *text) {
+    const size_t length = strlen(text);
+    put_count(w, 0xa0, 31, 0xda, length);
+    put_bytes(w, text, length);
 }
 
 static void put_real(writer *w, const br_wire_field *field, double value) {
@@ -403,11 +418,19 @@ static void put_field(writer *w, const br_wire_field *field, const char *message
         w->failed |= !fits(field, at, strlen(at));
         put_text(w, at);
         break;
+    case BR_BYTES: {
+        const int count = *(const int *)(message + field->count_at);
+        w->failed |= count < 0 || count > field->most;
+        put(w, 0xc5, (uint64_t)count, 2);
+        put_bytes(w, at, w->failed ? 0 : (size_t)count);
+        break;
+    }
     case BR_MEASURES:
         put_measures(w, field, (const br_measures *)at);
         break;
     default:
         put_array(w, field, message);
+        break;
     }
 }
 

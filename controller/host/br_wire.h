@@ -15,6 +15,7 @@ typedef enum {
     BR_REAL,    /* double */
     BR_FLAG,    /* int, 0 or 1 */
     BR_TEXT,    /* char[4 * most + 1], of UTF-8: at most so many characters, none of them 0 */
+    BR_BYTES,   /* uint8_t[most] */
     BR_WHOLES,  /* int64_t[most] */
     BR_REALS,   /* double[most] */
     BR_RECORDS, /* most structures of their own table */

@@ -1,7 +1,7 @@
 /* A controller without Python, for one control problem, which is linked in.
  *
  *   bayesrace-controller DATA LINK [--rate HZ] [--budget SHARE] [--telemetry]
- *                        [--fifo PRIORITY] [--cpu N] [--lock-memory]
+ *                        [--key FILE] [--fifo PRIORITY] [--cpu N] [--lock-memory]
  *
  * DATA: folder of 'bayesrace export': racing line, weights, settings. LINK: see br_transport.h.
  * Ends with SIGINT or SIGTERM, or with standard input; then says what it has counted.
@@ -21,6 +21,7 @@
 #define NAME "bayesrace-controller"
 
 static br_host host; /* too large for a stack */
+static br_seal seal;
 
 static void stop(int signal_number) {
     (void)signal_number;
@@ -37,27 +38,29 @@ static int failed(const char *what, const char *why) {
 typedef struct {
     double rate_hz, budget, fifo, cpu;
     int telemetry, lock_memory;
+    const char *key;
 } options;
 
 typedef struct {
     const char *name;
     double *number, low, high; /* of an option with a number, or */
     int *flag, whole;
-    const char *meaning;
+    const char *meaning, **word;
 } option;
 
 static int usage(const option *known, int count) {
     fprintf(stderr, "usage: " NAME " DATA LINK [option ...]\n"
                     "  DATA  folder that 'bayesrace export' has written\n"
-                    "  LINK  udp:ADDRESS:PORT, unix:PATH or stdio\n");
+                    "  LINK  udp:ADDRESS:PORT, unix:PATH, serial:DEVICE[:BAUD] or stdio\n");
     for (int i = 0; i < count; ++i)
         fprintf(stderr, "  %-14s %s\n", known[i].name, known[i].meaning);
     return 2;
 }
 
-/* The number behind an option; 0, or -1 if it is none, or not within the option's limits. */
-static int read_number(const option *of, const char *word) {
+/* The number or word behind an option; 0, or -1 if it is none, or not within its limits. */
+static int read_value(const option *of, const char *word) {
     char *end = NULL;
+    if (of->word) return (*of->word = word) ? 0 : -1;
     const double value = word ? strtod(word, &end) : 0;
     if (!end || end == word || *end || !(value >= of->low && value <= of->high)) return -1;
     if (of->whole && value != floor(value)) return -1;
@@ -68,13 +71,15 @@ static int read_number(const option *of, const char *word) {
 /* The options behind the arguments; 0, or an exit code. */
 static int read_options(int argc, char **argv, options *o) {
     const option known[] = {
-        {"--rate", &o->rate_hz, 1, 500, NULL, 0, "HZ: in real time, 1 to 500; default 50"},
+        {"--rate", &o->rate_hz, 1, 500, NULL, 0, "HZ: in real time, 1 to 500; default 50", NULL},
         {"--budget", &o->budget, 0.05, 1, NULL, 0,
-         "SHARE: of the period that a cycle may take, 0.05 to 1; default 0.8"},
-        {"--telemetry", NULL, 0, 0, &o->telemetry, 0, "send plan, residuals and timing as well"},
-        {"--fifo", &o->fifo, 1, 99, NULL, 1, "PRIORITY: by SCHED_FIFO, 1 to 99"},
-        {"--cpu", &o->cpu, 0, CPU_SETSIZE - 1, NULL, 1, "N: run on that processor alone"},
-        {"--lock-memory", NULL, 0, 0, &o->lock_memory, 0, "lock the memory against paging"}};
+         "SHARE: of the period that a cycle may take, 0.05 to 1; default 0.8", NULL},
+        {"--telemetry", NULL, 0, 0, &o->telemetry, 0, "send plan, residuals and timing as well",
+         NULL},
+        {"--key", NULL, 0, 0, NULL, 0, "FILE: datagrams are under this key", &o->key},
+        {"--fifo", &o->fifo, 1, 99, NULL, 1, "PRIORITY: by SCHED_FIFO, 1 to 99", NULL},
+        {"--cpu", &o->cpu, 0, CPU_SETSIZE - 1, NULL, 1, "N: run on that processor alone", NULL},
+        {"--lock-memory", NULL, 0, 0, &o->lock_memory, 0, "lock the memory against paging", NULL}};
     const int count = sizeof known / sizeof known[0];
     if (argc < 3) return usage(known, count);
     for (int i = 3; i < argc; ++i) {
@@ -86,7 +91,7 @@ static int read_options(int argc, char **argv, options *o) {
         }
         if (known[k].flag) {
             *known[k].flag = 1;
-        } else if (read_number(&known[k], argv[++i])) { /* behind the last word is NULL */
+        } else if (read_value(&known[k], argv[++i])) { /* behind the last word is NULL */
             failed(known[k].name, known[k].meaning);
             return 2;
         }
@@ -124,6 +129,7 @@ static void report(void) {
         {"datagrams refused", timing->refused},
         {"from others", timing->from_others},
         {"commands", timing->commands},
+        {"requests about weights", timing->updates},
         {"readings left out", timing->readings_left_out},
         {"cycles", timing->ticks},
         {"solution", count->levels[BR_SOLUTION]},
@@ -136,6 +142,9 @@ static void report(void) {
         {"overruns", timing->overruns},
         {"late states", timing->late_states},
         {"unsent", host.link.unsent},
+        {"bad frames", host.link.bad_frames},
+        {"forged", seal.forged},
+        {"replayed", seal.replayed},
     };
     fprintf(stderr, NAME ":");
     for (size_t i = 0; i < sizeof counts / sizeof counts[0]; ++i)
@@ -153,12 +162,14 @@ int main(int argc, char **argv) {
     sigaction(SIGINT, &ends, NULL);
     sigaction(SIGTERM, &ends, NULL);
     signal(SIGPIPE, SIG_IGN); /* who no longer reads does not end it at once */
+    if (o.key && br_seal_read(&seal, o.key, why, sizeof why)) return failed("--key", why);
     if (br_host_open(&host, argv[1], argv[2], o.rate_hz, why, sizeof why)) {
         fprintf(stderr, NAME ": %s\n", why);
         return 1;
     }
     host.budget = o.budget;
     host.telemetry = o.telemetry;
+    if (o.key) host.link.seal = &seal;
     prepare_process(&o);
     fprintf(stderr, NAME ": ready at %s\n", argv[2]);
     br_host_serve(&host);

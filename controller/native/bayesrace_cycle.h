@@ -213,7 +213,8 @@ BR_API br_mpc_error br_cycle_set_driving(br_cycle *cycle, const br_driving *sett
 BR_API br_mpc_error br_cycle_set_clock(br_cycle *cycle, br_mpc_clock clock, void *context);
 
 /* How states are estimated that are not measured as a whole, by this model, which must stay; NULL:
- * that of the compiled controller, with its variance. BR_ERROR_NULL without any; else as for
+ * that of the compiled controller, with its variance. BR_ERROR_NULL without any; BR_ERROR_LEFT_OUT
+ * with BR_HAS_ESTIMATOR 0, with which such a state counts as one that is not known; else as for
  * br_estimator_set. Begins anew. What it knows is read by br_estimator_read. */
 BR_API br_mpc_error br_cycle_set_estimation(br_cycle *cycle, const br_mpc *model,
                                             const br_estimation *settings);

@@ -30,7 +30,11 @@ extern "C" {
 #define BR_OFFSETS 2               /* of yaw rate and steering angle, in this order */
 #define BR_NB (BR_NX + BR_OFFSETS) /* what is estimated, beside accelerations */
 #define BR_INSTRUMENTS 8
+#if BR_HAS_ESTIMATOR
 #define BR_EVENTS 64 /* of the newest periods and measurements that are kept to be done over */
+#else
+#define BR_EVENTS 1
+#endif
 
 /* Why a measured state, or an instrument, is not believed: see br_state.c, br_instrument.c and
  * br_cycle_fault_text. */

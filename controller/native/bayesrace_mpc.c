@@ -25,7 +25,7 @@ static br_instructions supported(void) {
     unsigned a, b, c, d, features, extended, kept, unused;
     if (!__get_cpuid(1, &a, &b, &c, &d) || !has(c, FMA_OSXSAVE_AVX)) return BR_BASELINE;
     if (!__get_cpuid_count(7, 0, &a, &features, &c, &d)) return BR_BASELINE;
-    if (!__get_cpuid(0x80000001, &a, &b, &extended, &d)) return BR_BASELINE;
+    if (!__get_cpuid(0x80000001u, &a, &b, &extended, &d)) return BR_BASELINE;
     __asm__("xgetbv" : "=a"(kept), "=d"(unused) : "c"(0));
     if (!has(features, BMI_AVX2_BMI2) || !has(extended, LZCNT) || !has(kept, KEEPS_YMM))
         return BR_BASELINE;
@@ -62,10 +62,10 @@ br_mpc_error br_mpc_init(void *memory, size_t size, br_mpc **out) {
     if (size < sizeof(br_mpc) || (uintptr_t)memory % 64) return BR_ERROR_MEMORY;
     br_mpc *mpc = memory;
     memset(mpc, 0, offsetof(br_mpc, gp));
-    for (int i = 0; i < 3; ++i) br_gp_clear(&mpc->gp[i]);
+    for (int i = 0; i < BR_WEIGHT_BUFFERS; ++i) br_gp_clear(&mpc->gp[i]);
     br_qp_init(&mpc->qp);
     atomic_init(&mpc->spare, BR_SPARE_FREE);
-    mpc->gp_spare = 1;
+    mpc->gp_spare = BR_WEIGHT_BUFFERS > 1;
     br_caution_reset(&mpc->caution);
     br_mismatch_reset(&mpc->mismatch);
     mpc->code = codes[supported()];
@@ -200,6 +200,17 @@ br_mpc_error br_mpc_get_speeds(const br_mpc *mpc, double *speeds_mps, int n) {
     memcpy(speeds_mps, mpc->path.speed[mpc->path.buffer], (size_t)n * sizeof *speeds_mps);
     return BR_OK;
 }
+
+br_mpc_error br_mpc_get_loss(const br_mpc *mpc, double *lost_s) {
+    if (!mpc || !lost_s) return BR_ERROR_NULL;
+    const br_path *path = &mpc->path;
+    if (!path->ready) return BR_ERROR_NOT_READY;
+    *lost_s = 0;
+    for (int i = 0; i < path->n; ++i)
+        *lost_s +=
+            path->spacing * (1 / path->speed[path->buffer][i] - 1 / path->table[i][BR_LINE_SPEED]);
+    return BR_OK;
+}
 #endif
 
 br_mpc_error br_mpc_get_tube(const br_mpc *mpc, double tube[BR_N]) {
@@ -281,10 +292,11 @@ br_mpc_error br_mpc_evaluate(const br_mpc *mpc, const double v[BR_NV], const dou
 /* --- new weights between two steps: staged by any one thread, adopted by the control
  * thread, which goes back to the proven ones if they are worse.
  *
- * There are three buffers: in use, proven, and spare; the former two may be the same one.
- * mpc->spare is the state of the spare buffer. A thread takes the buffer by setting BR_SPARE_TAKEN
- * (acquire) and gives it back by storing another state (release), so no staging writes a buffer
- * that an earlier step may still be reading. --- */
+ * There are three buffers: in use, proven, and spare; the former two may be the same one. Or there
+ * is one, which is all of them, so that nothing can be staged. mpc->spare is the state of the spare
+ * buffer. A thread takes the buffer by setting BR_SPARE_TAKEN (acquire) and gives it back by
+ * storing another state (release), so no staging writes a buffer that an earlier step may still be
+ * reading. --- */
 
 static int take_from(br_mpc *mpc, int owner) {
     return atomic_compare_exchange_strong_explicit(&mpc->spare, &owner, BR_SPARE_TAKEN,
@@ -311,7 +323,8 @@ static void limit_speeds(br_mpc *mpc) {
 
 /* Other weights are in use from the next step on. */
 static void use(br_mpc *mpc, int buffer) {
-    const int same = mpc->gp[buffer].identity == mpc->gp[mpc->gp_in_use].identity;
+    const int same =
+        buffer != mpc->gp_in_use && mpc->gp[buffer].identity == mpc->gp[mpc->gp_in_use].identity;
     mpc->gp_in_use = buffer;
 #if BR_HAS_PATH
     /* a reference that knows more does not leap ahead */
@@ -329,21 +342,24 @@ static void use(br_mpc *mpc, int buffer) {
  * being proven are given up. */
 static void exchange(br_mpc *mpc) {
     const int before = mpc->gp_in_use, after = mpc->gp_spare;
-    mpc->gp_spare = before == mpc->gp_proven ? 3 - before - after : before;
+    if (BR_WEIGHT_BUFFERS > 1)
+        mpc->gp_spare = before == mpc->gp_proven ? 3 - before - after : before;
     use(mpc, after);
 }
 
 /* Into the spare buffer, which the caller has taken. */
 static br_mpc_error load(br_mpc *mpc, const br_mpc_gp outputs[BR_NE]) {
     const br_mpc_error error = mpc->code->load(&mpc->gp[mpc->gp_spare], outputs);
+    if (error) br_gp_clear(&mpc->gp[mpc->gp_spare]);
 #if BR_HAS_PATH
-    if (!error) mpc->code->limit(mpc, mpc->gp_spare);
+    mpc->code->limit(mpc, mpc->gp_spare);
 #endif
     return error;
 }
 
 br_mpc_error br_mpc_stage_weights(br_mpc *mpc, const br_mpc_gp outputs[BR_NE]) {
     if (!mpc || !outputs) return BR_ERROR_NULL;
+    if (BR_WEIGHT_BUFFERS == 1) return BR_ERROR_LEFT_OUT;
     if (!take_from(mpc, BR_SPARE_STAGED) && !take_from(mpc, BR_SPARE_FREE)) return BR_ERROR_BUSY;
     const br_mpc_error error = load(mpc, outputs);
     hand_over(mpc, error ? BR_SPARE_FREE : BR_SPARE_STAGED);
@@ -352,6 +368,7 @@ br_mpc_error br_mpc_stage_weights(br_mpc *mpc, const br_mpc_gp outputs[BR_NE]) {
 
 br_mpc_error br_mpc_adopt_weights(br_mpc *mpc) {
     if (!mpc) return BR_ERROR_NULL;
+    if (BR_WEIGHT_BUFFERS == 1) return BR_ERROR_LEFT_OUT;
     if (!take_from(mpc, BR_SPARE_STAGED)) return BR_ERROR_NOT_STAGED;
     exchange(mpc);
     hand_over(mpc, BR_SPARE_FREE);
@@ -362,7 +379,7 @@ br_mpc_error br_mpc_set_weights(br_mpc *mpc, const br_mpc_gp outputs[BR_NE]) {
     if (!mpc || !outputs) return BR_ERROR_NULL;
     if (!take_from(mpc, BR_SPARE_STAGED) && !take_from(mpc, BR_SPARE_FREE)) return BR_ERROR_BUSY;
     const br_mpc_error error = load(mpc, outputs);
-    if (!error) exchange(mpc); /* else the weights in use stay */
+    if (!error || BR_WEIGHT_BUFFERS == 1) exchange(mpc); /* else the weights in use stay */
     hand_over(mpc, BR_SPARE_FREE);
     return error ? error : br_mpc_prove_weights(mpc);
 }
@@ -375,6 +392,7 @@ br_mpc_error br_mpc_prove_weights(br_mpc *mpc) {
 
 br_mpc_error br_mpc_revert_weights(br_mpc *mpc) {
     if (!mpc) return BR_ERROR_NULL;
+    if (BR_WEIGHT_BUFFERS == 1) return BR_ERROR_LEFT_OUT;
     if (mpc->gp_in_use != mpc->gp_proven) use(mpc, mpc->gp_proven);
     return BR_OK;
 }
@@ -385,7 +403,7 @@ br_mpc_error br_mpc_get_watch(const br_mpc *mpc, const double resolution[BR_NE],
                               br_mpc_watch *out) {
     if (!mpc || !resolution || !out) return BR_ERROR_NULL;
     const br_watch *watch = &mpc->watch;
-    double weights[BR_NE] = {0};
+    double weights[BR_NE] = {};
     memset(out, 0, sizeof *out);
     out->fresh = (double)(watch->count - watch->since);
     for (int64_t k = watch->count - 1; k >= 0 && k >= watch->count - BR_WATCHED; --k) {
@@ -442,6 +460,8 @@ const char *br_mpc_error_text(br_mpc_error error) {
         [BR_ERROR_BUSY] = "another thread is staging weights",
         [BR_ERROR_NOT_STAGED] = "no weights are staged",
         [BR_ERROR_INSTRUCTIONS] = "this processor lacks these instructions",
+        [BR_ERROR_LEFT_OUT] = "it needs what was left out of this build by --weight-buffers or "
+                              "--no-estimator",
     };
     return (unsigned)error < sizeof texts / sizeof texts[0] ? texts[error] : "unknown error";
 }

@@ -24,7 +24,9 @@
 #include <stddef.h>
 #include <stdint.h>
 
-#include "br_config.h"  /* generated: BR_N, BR_TS, BR_GP_CAPACITY, BR_MODEL_IDENTITY, BR_ABI */
+#include "br_config.h"  /* generated: BR_N, BR_TS, BR_GP_CAPACITY, BR_PATH_CAPACITY (points of the
+                         * path table), BR_WEIGHT_BUFFERS, BR_HAS_ESTIMATOR, BR_MODEL_IDENTITY,
+                         * BR_ABI */
 #include "br_problem.h" /* generated: sizes, BR_PARAMETERS, br_mpc_reference */
 
 #ifdef __cplusplus
@@ -41,7 +43,6 @@ enum {
 };
 #define BR_NV (BR_NX + BR_NU) /* stage variables v = [x; u] */
 #define BR_PATH_COLUMNS 7     /* see br_mpc_set_path */
-#define BR_PATH_CAPACITY 8192 /* points of the path table */
 #define BR_PREDICT_MAX_S 1.0  /* longest br_mpc_predict */
 
 #if defined(BR_API) /* as it is given */
@@ -66,7 +67,8 @@ typedef enum {
     BR_ERROR_STATE,
     BR_ERROR_BUSY,
     BR_ERROR_NOT_STAGED,
-    BR_ERROR_INSTRUCTIONS
+    BR_ERROR_INSTRUCTIONS,
+    BR_ERROR_LEFT_OUT
 } br_mpc_error;
 
 /* What becomes of the optimisation problem. The first two are usable. */
@@ -190,6 +192,40 @@ typedef struct {
     double nominal[BR_NE]; /* of the model without correction */
 } br_mpc_watch;
 
+/* When weights on probation are worse than the proven ones: GateSettings in
+ * controller/settings.py, which says what each means. */
+#define BR_PROBATION_FIELDS(REAL, WHOLE)                           \
+    REAL(worse_factor)                                             \
+    REAL(worse_share)                                              \
+    REAL(watch_samples) /* of driving, after which weights stay */ \
+    REAL(slow_share)                                               \
+    REAL(slow_least_mps) /* to which any car may be slowed down */ \
+    WHOLE(watch_least)                                             \
+    WHOLE(watch_cycles)
+
+typedef struct {
+    BR_PROBATION_FIELDS(BR_REAL_MEMBER, BR_WHOLE_MEMBER)
+    double resolution[BR_NE]; /* errors per stage that do not count, above 0 */
+} br_mpc_probation;
+
+/* What to do about weights on probation. */
+typedef enum {
+    BR_WATCH_ON, /* nothing */
+    BR_PROVEN,   /* they stay */
+    BR_SLOW,     /* they predict some outputs worse and others better: slow down */
+    BR_BACK,     /* they predict worse: go back to the proven ones */
+    BR_HOPELESS  /* go back, as hardly any cycle finds a solution */
+} br_mpc_ruling;
+
+/* Of weights from their adoption on; zeros then. */
+typedef struct {
+    br_mpc_watch found; /* when they were looked at last */
+    int64_t cycles, fallen_back;
+    double fastest_mps;
+    double limit_mps; /* to which the car is to slow down; 0: it is not */
+    double judged, slowed_after;
+} br_mpc_trial;
+
 typedef enum {
     BR_KERNEL_RBF = 0,
     BR_KERNEL_MATERN05 = 1,
@@ -225,7 +261,8 @@ BR_API br_mpc_error br_mpc_set_path(br_mpc *mpc, const double *table, int n, dou
 /* Copies the weights and, where signal is given, makes what the posterior variance needs; the next
  * step uses them. Some 4 ms per 400 points and output, and 0.1 ms per wheelbase of the path for its
  * speeds (br_mpc_get_speeds), which another path or other parameters change, too. What is staged is
- * forgotten. BR_ERROR_BUSY while another thread stages. */
+ * forgotten. BR_ERROR_BUSY while another thread stages. Where there is one buffer of weights, none
+ * are left after an error: there is no correction. */
 BR_API br_mpc_error br_mpc_set_weights(br_mpc *mpc, const br_mpc_gp outputs[BR_NE]);
 
 /* The same in two parts, for a control loop that has no time to copy. br_mpc_stage_weights copies
@@ -237,7 +274,10 @@ BR_API br_mpc_error br_mpc_set_weights(br_mpc *mpc, const br_mpc_gp outputs[BR_N
  * br_mpc_adopt_weights, between two steps, puts what is staged into use: an exchange of buffers,
  * about a microsecond. Then as after br_mpc_set_weights: plan and multipliers stay, and a
  * br_mpc_prepare before the next step does the linearisation anew. BR_ERROR_NOT_STAGED if there is
- * nothing; never waits. */
+ * nothing; never waits.
+ *
+ * Both, and br_mpc_revert_weights, need BR_WEIGHT_BUFFERS 3 (in use, proven, spare); with 1 they do
+ * nothing but BR_ERROR_LEFT_OUT, weights are set before driving, and no samples are kept. */
 BR_API br_mpc_error br_mpc_stage_weights(br_mpc *mpc, const br_mpc_gp outputs[BR_NE]);
 BR_API br_mpc_error br_mpc_adopt_weights(br_mpc *mpc);
 
@@ -256,6 +296,14 @@ BR_API br_mpc_error br_mpc_adopt_weights(br_mpc *mpc);
  * thread that steps. */
 BR_API br_mpc_error br_mpc_get_watch(const br_mpc *mpc, const double resolution[BR_NE],
                                      br_mpc_watch *watch);
+
+/* Judges weights on probation, between two calls, as GateSettings says. br_mpc_observe_trial is
+ * called for each state, with its speed and whether the fallback drove in the cycle before it; -1:
+ * the car was not driven. The caller carries out the ruling: after BR_SLOW the trial goes on, on
+ * samples from then on, and does not end by proof; after others it is over. */
+BR_API void br_mpc_observe_trial(br_mpc_trial *trial, double vx_mps, int fallen_back);
+BR_API br_mpc_ruling br_mpc_judge_trial(const br_mpc *mpc, const br_mpc_probation *probation,
+                                        br_mpc_trial *trial);
 BR_API br_mpc_error br_mpc_prove_weights(br_mpc *mpc);
 BR_API br_mpc_error br_mpc_revert_weights(br_mpc *mpc);
 BR_API br_mpc_error br_mpc_get_samples(const br_mpc *mpc, double features[BR_SAMPLES * BR_NZ],
@@ -402,6 +450,9 @@ BR_API br_mpc_error br_mpc_get_reference(const br_mpc *mpc, br_mpc_reference ref
  * use do not know the car well enough. Without caution, or where the residual's variance is not
  * known, the line's. The thread that stages weights may ask, too. */
 BR_API br_mpc_error br_mpc_get_speeds(const br_mpc *mpc, double *speeds_mps, int n);
+
+/* What a lap loses to the line's speeds by that. */
+BR_API br_mpc_error br_mpc_get_loss(const br_mpc *mpc, double *lost_s);
 #endif
 
 /* How uncertain the last step's plan is: for each stage, half the width that uncertainty takes of

@@ -179,7 +179,7 @@ static double half_tube(const br_mpc *mpc, int k, int r, const double *gradient)
             along += gradient[n] * mpc->caution.deviation[k][j][BR_ROW_INDEX[n]];
         squares += along * along;
     }
-    return squares >= 0 ? mpc->parameters.caution_sigmas * sqrt(squares) : INFINITY;
+    return squares >= 0 ? mpc->parameters.caution_sigmas * sqrt(squares) : (double)INFINITY;
 }
 
 /* The widest of the rows by stage, of the plan that the step began with. Returns the largest share

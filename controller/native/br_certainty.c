@@ -48,10 +48,9 @@ typedef struct {
     double speed, acceleration, curvature; /* of the line */
     double room;                           /* that errors may take of half the track's width */
     double v[BR_NV];
-    br_stage stage; /* linearised there */
-    double off;     /* of the line, by the trial before; */
-    double known;   /* the speed of this one, */
-    int decided;    /* which is the last */
+    double off;   /* of the line, by the trial before; */
+    double known; /* the speed of this one, */
+    int decided;  /* which is the last */
 } place_on_line;
 
 /* Solves m x = b, m symmetric and positive definite; x in place of b. */
@@ -71,12 +70,12 @@ static void solve_small(double m[FREE][FREE], double b[FREE]) {
 static void improve_state(const br_mpc *mpc, const br_gp *gp, place_on_line *at, double gained,
                           const double guess[FREE]) {
     const br_mpc_parameters *p = &mpc->parameters;
-    const br_stage *stage = &at->stage;
+    br_stage stage;
     const double wanted[FREE] = {gained, 0, gained * at->curvature};
     const double unit[FREE] = {BR_STATE_DEVIATION[BR_INDEX_VY], BR_STATE_DEVIATION[BR_INDEX_DELTA],
                                BR_INPUT_EFFORT[BR_INDEX_DUTY]};
     double m[FREE][FREE] = {{0}}, b[FREE], row[FREE];
-    br_stage_linearise(gp, at->v, at->v + BR_NX, &at->stage);
+    br_stage_linearise(gp, at->v, at->v + BR_NX, &stage);
     for (int a = 0; a < FREE; ++a) {
         const double size = guess_share[a] * unit[a];
         m[a][a] = 1 / (size * size);
@@ -84,9 +83,9 @@ static void improve_state(const br_mpc *mpc, const br_gp *gp, place_on_line *at,
     }
     for (int i = 0; i < FREE; ++i) {
         const double size = error_share * BR_STATE_DEVIATION[going[i]];
-        const double error = (stage->f[going[i]] - at->v[going[i]] - wanted[i]) / size;
+        const double error = (stage.f[going[i]] - at->v[going[i]] - wanted[i]) / size;
         for (int a = 0; a < FREE; ++a)
-            row[a] = (stage->jacobian[going[i]][sought[a]] - (sought[a] == going[i])) / size;
+            row[a] = (stage.jacobian[going[i]][sought[a]] - (sought[a] == going[i])) / size;
         for (int a = 0; a < FREE; ++a) {
             b[a] -= row[a] * error;
             for (int c = 0; c < FREE; ++c) m[a][c] += row[a] * row[c];
@@ -111,7 +110,6 @@ static void seek_state(const br_mpc *mpc, const br_gp *gp, place_on_line *at, do
     at->v[BR_INDEX_OMEGA] = speed * at->curvature;
     for (int round = 0; round < ROUNDS; ++round)
         improve_state(mpc, gp, at, BR_TS * at->acceleration * share * share, guess);
-    br_stage_linearise(gp, at->v, at->v + BR_NX, &at->stage);
 }
 
 /* The same at the line's speed: from that of a slow car, which rolls as its wheels point. */
@@ -151,8 +149,13 @@ static void try_slower(const br_mpc *mpc, const br_gp *gp, const double variance
 }
 
 /* Speeds that are known well enough, of so many places. */
-static void known_speeds(const br_mpc *mpc, const br_gp *gp, int places, place_on_line at[PLACES]) {
+static void known_speeds(br_mpc *mpc, const br_gp *gp, int places, place_on_line at[PLACES]) {
+    /* With one buffer nothing is staged beside the steps, whose memory this then may use. */
+#if BR_WEIGHT_BUFFERS == 1
+    double (*work)[BR_COLUMNS] = mpc->caution.correlations;
+#else
     BR_ALIGNED double work[BR_GP_ROOT][BR_COLUMNS];
+#endif
     double x[PLACES][BR_NX], u[PLACES][BR_NU], variance[PLACES][BR_NE];
     for (int i = 0; i < places; ++i) begin_state(mpc, gp, &at[i]);
     for (int left = places; left;) {

@@ -216,7 +216,9 @@ static void report(br_cycle *cycle) {
 
 /* The residual where the car is, for the next estimate. */
 static void foresee(br_cycle *cycle) {
-    if (cycle->has_residual || cycle->unknown || !cycle->mpc || !cycle->estimator.count) return;
+    if (!BR_HAS_ESTIMATOR || cycle->has_residual || cycle->unknown || !cycle->mpc ||
+        !cycle->estimator.count)
+        return;
     double v[BR_NV];
     br_residual *residual = &cycle->residual;
     br_mpc_mismatch mismatch;
@@ -256,6 +258,12 @@ static int estimate(br_cycle *cycle, const br_measured *before, br_mpc_noise *no
     const int begins = cycle->unknown, given = newest->measurements;
     const int most = given < BR_MEASUREMENTS ? given : BR_MEASUREMENTS;
     memcpy(newest->x, cycle->unknown ? none : before->x, sizeof newest->x);
+    if (!BR_HAS_ESTIMATOR) {
+        cycle->unknown = 1;
+        cycle->doubt = BR_FAULT_NONE;
+        cycle->counters.fault = BR_FAULT_NONE;
+        return 0;
+    }
     foresee(cycle);
     catch_up(cycle);
     br_estimator *estimator = &cycle->estimator;
@@ -439,7 +447,8 @@ static int at_acting(br_cycle *cycle, double u[BR_NU], br_carried *carried) {
 
 /* The same for a step, which gets the covariance of an estimated state. */
 static int begin_step(br_cycle *cycle, double u[BR_NU]) {
-    if (!cycle->mpc || !cycle->stream.newest.estimated) return at_acting(cycle, u, NULL);
+    if (!BR_HAS_ESTIMATOR || !cycle->mpc || !cycle->stream.newest.estimated)
+        return at_acting(cycle, u, NULL);
     br_estimator *estimator = &cycle->estimator;
     br_carried carried = {.estimator = estimator,
                           .residual = &br_estimator_newest(estimator)->residual,

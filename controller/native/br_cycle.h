@@ -82,8 +82,6 @@ br_level br_fallback_decide(br_fallback *fallback, const br_driving *settings,
                             double late_s, double u[BR_NU]);
 br_level br_fallback_brake(const br_fallback *fallback, const br_driving *settings, double vx_mps,
                            double time_s, double u[BR_NU]);
-void br_fallback_plan(const br_fallback *fallback, const br_driving *settings, double time_s,
-                      double u[BR_NU]);
 void br_fallback_brake_to(const br_driving *settings, double vx_mps, double delta_rad,
                           double angle_rad, double duration_s, double u[BR_NU]);
 

@@ -27,6 +27,7 @@ size_t br_estimator_memory_size(void) { return sizeof(br_estimator); }
 
 br_mpc_error br_estimator_init(void *memory, size_t size, const br_mpc *mpc, br_estimator **out) {
     if (!memory || !mpc || !out) return BR_ERROR_NULL;
+    if (!BR_HAS_ESTIMATOR) return BR_ERROR_LEFT_OUT;
     if (size < sizeof(br_estimator) || (uintptr_t)memory % _Alignof(br_estimator))
         return BR_ERROR_MEMORY;
     br_estimator *estimator = memory;
@@ -161,7 +162,7 @@ static double take(const br_estimator *estimator, double gate, const br_measurem
     for (int a = 0; a < n; ++a) {
         for (int c = 0; c < n; ++c) s[a][c] = br_estimate_observed(hp[a], m->of[c]);
         s[a][a] += m->deviation[a] * m->deviation[a];
-        memcpy(wide[a], s[a], n * sizeof s[a][0]);
+        memcpy(wide[a], s[a], (size_t)n * sizeof s[a][0]);
     }
     br_bias_widen(estimator, m, b, wide);
     const double squared = distance(n, wide, fresh);
@@ -201,7 +202,8 @@ static int insert(br_estimator *estimator, int k, const br_event *given) {
         k -= 1;
     }
     const int free = estimator->order[estimator->count];
-    memmove(estimator->order + k + 1, estimator->order + k, (estimator->count - k) * sizeof(int));
+    memmove(estimator->order + k + 1, estimator->order + k,
+            (size_t)(estimator->count - k) * sizeof(int));
     estimator->order[k] = free;
     estimator->events[free] = *given;
     estimator->count += 1;

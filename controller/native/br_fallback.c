@@ -64,8 +64,8 @@ void br_fallback_brake_to(const br_driving *s, double vx_mps, double delta_rad, 
 }
 
 /* The plan's input that is due. */
-void br_fallback_plan(const br_fallback *fallback, const br_driving *s, double time_s,
-                      double u[BR_NU]) {
+static void follow_plan(const br_fallback *fallback, const br_driving *s, double time_s,
+                        double u[BR_NU]) {
     const int row = row_due(fallback, time_s);
     limited(s, fallback->plan[row < fallback->rows ? row : fallback->rows - 1], u);
 }
@@ -131,7 +131,7 @@ static double roll_out(const br_rollout *from, int first, br_braking *braking) {
         if (row == 0)
             memcpy(u, from->u, sizeof u);
         else if (row < first)
-            br_fallback_plan(from->fallback, settings, from->time_s + row * BR_TS, u);
+            follow_plan(from->fallback, settings, from->time_s + row * BR_TS, u);
         else
             br_fallback_brake_to(settings, vx, x[BR_INDEX_DELTA], angle, BR_TS, u);
         if (controller->predict(controller->self, x, u, BR_TS, x) ||

@@ -131,7 +131,7 @@ static void add_sums(const br_gp_output *gp, int first, int group, const int gro
         for (; s + TILE <= stages; s += TILE)
             add_tile(TILE, points, columns, weights + s, &sums[stride * s + 8 * g], stride);
         for (; s < stages; ++s)
-            add_tile(1, points, columns, weights + s, &sums[stride * (size_t)s + 8 * g], stride);
+            add_tile(1, points, columns, weights + s, &sums[stride * s + 8 * g], stride);
     }
 }
 
@@ -140,7 +140,7 @@ static void scaled(const br_gp_output *gp, const double z[BR_NZ], double q[BR_NZ
 }
 
 void br_gp_evaluate(const br_gp *gp, int stages, double (*z)[BR_NZ], br_gp_row *kept, int room,
-                    br_correction *out) {
+                    br_correction *const out[]) {
     for (int j = 0; j < BR_NE; ++j) {
         const br_gp_output *output = &gp->output[j];
         const int rbf = output->kernel == BR_KERNEL_RBF;
@@ -148,7 +148,7 @@ void br_gp_evaluate(const br_gp *gp, int stages, double (*z)[BR_NZ], br_gp_row *
         BR_ALIGNED double sums[BR_N][8 * BR_GP_FIRST];
         br_vec mean[BR_N];
         double q[BR_N][BR_NZ];
-        memset(sums, 0, stages * sizeof sums[0]);
+        memset(sums, 0, (size_t)stages * sizeof sums[0]);
         for (int s = 0; s < stages; ++s) {
             scaled(output, z[s], q[s]);
             mean[s] = br_splat(0.0);
@@ -160,11 +160,11 @@ void br_gp_evaluate(const br_gp *gp, int stages, double (*z)[BR_NZ], br_gp_row *
             add_sums(output, first, 0, BR_GP_FIRST, stages, rbf ? bend : slope, sums[0]);
         }
         for (int s = 0; s < stages; ++s) {
-            double *slopes = out[s].sums[j];
-            out[s].mean[j] = output->offset + br_sum(mean[s]);
+            double *slopes = out[s]->sums[j];
+            out[s]->mean[j] = output->offset + br_sum(mean[s]);
             for (int c = 0; c < 8 * BR_GP_FIRST; ++c) slopes[c] = rbf ? -sums[s][c] : sums[s][c];
             for (int a = 0; a < BR_NZ; ++a)
-                out[s].gradient[j][a] =
+                out[s]->gradient[j][a] =
                     (q[s][a] * slopes[0] - slopes[1 + a]) * output->inverse_scale[a];
         }
     }
@@ -198,13 +198,13 @@ static void add_hessian(const br_gp_output *gp, const double q[BR_NZ], double we
 void br_gp_curvature(const br_gp *gp, int stages, double (*z)[BR_NZ], br_gp_row *kept,
                      const br_correction *const values[], double (*weight)[BR_NE],
                      double (*out)[BR_NZ][BR_NZ]) {
-    memset(out, 0, stages * sizeof out[0]);
+    memset(out, 0, (size_t)stages * sizeof out[0]);
     for (int j = 0; j < BR_NE; ++j) {
         const br_gp_output *output = &gp->output[j];
         if (output->kernel == BR_KERNEL_MATERN05) continue; /* see above */
         BR_ALIGNED double first[BR_N][8 * BR_GP_FIRST], second[BR_N][8 * BR_GP_SECOND];
-        memset(first, 0, stages * sizeof first[0]);
-        memset(second, 0, stages * sizeof second[0]);
+        memset(first, 0, (size_t)stages * sizeof first[0]);
+        memset(second, 0, (size_t)stages * sizeof second[0]);
         br_gp_row *bend = kept + BR_GP_BLOCKS * stages * j;
         for (int i = 0; i < output->n_padded; i += BR_GP_BLOCK, bend += stages) {
             add_sums(output, i, BR_GP_FIRST, BR_GP_SECOND, stages, bend, second[0]);

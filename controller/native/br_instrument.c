@@ -37,8 +37,8 @@ void br_instrument_arrive(br_instrument *instrument, const br_measurement *m, do
 
 int br_instrument_holds(const br_instrument *instrument, const br_measurement *m) {
     const br_measurement *held = &instrument->held;
-    return held->count == m->count && !memcmp(held->of, m->of, m->count * sizeof *m->of) &&
-           !memcmp(held->value, m->value, m->count * sizeof *m->value);
+    return held->count == m->count && !memcmp(held->of, m->of, (size_t)m->count * sizeof *m->of) &&
+           !memcmp(held->value, m->value, (size_t)m->count * sizeof *m->value);
 }
 
 int br_instrument_repeats(br_instrument *instrument, const br_measurement *m,

@@ -10,6 +10,9 @@
 #include "bayesrace_mpc.h"
 #include "br_kernel.h"
 
+_Static_assert(BR_WEIGHT_BUFFERS == 1 || BR_WEIGHT_BUFFERS == 3,
+               "one for all, or one each for the weights in use, the proven and the staged ones");
+
 /* Inputs that a QP changes alike make a block: each of the first BR_FREE stages is one, and of the
  * stages after them each BR_BLOCK. */
 #define BR_BLOCK_OF(k) ((k) < BR_FREE ? (k) : BR_FREE + ((k) - BR_FREE) / BR_BLOCK)
@@ -61,7 +64,8 @@ typedef struct {
     double speed_limit, speed_limit_rate; /* of the environment */
     double age;                           /* time since then */
     int buffer;                           /* of the speeds that count: as of the weights in use */
-    double speed[3][BR_PATH_CAPACITY];    /* as far as these know: see br_certainty.c */
+    /* as far as these know: see br_certainty.c */
+    double speed[BR_WEIGHT_BUFFERS][BR_PATH_CAPACITY];
 } br_path;
 
 /* Columns of the path's table. */
@@ -144,8 +148,8 @@ typedef struct {
     br_transition newest; /* not taken yet */
     int64_t count;        /* samples so far; the last BR_SAMPLES are kept */
     int64_t since;        /* of these, before the weights in use were adopted */
-    br_sample sample[BR_SAMPLES];
-    br_judged judged[BR_WATCHED]; /* the newest */
+    br_sample sample[BR_WEIGHT_BUFFERS > 1 ? BR_SAMPLES : 1]; /* with one buffer none is taken */
+    br_judged judged[BR_WEIGHT_BUFFERS > 1 ? BR_WATCHED : 1]; /* the newest */
 } br_watch;
 
 /* Of one output: what the errors of the corrected model say, older ones less, and what follows. */
@@ -303,8 +307,9 @@ struct br_mpc {
     double merit;   /* ... beside its cost */
     double worth;   /* cost, to first order, once the defects are gone: costates price them */
     br_mpc_info info;
-    br_gp gp[3]; /* in use, proven, spare. The last member of br_mpc, so that memory for points that
-                    the weights do not have is never written to */
+    br_gp gp[BR_WEIGHT_BUFFERS]; /* in use, proven, spare; or all in one. The last member of br_mpc,
+                                    so that memory for points that the weights do not have is never
+                                    written to */
 };
 
 /* The result and all before it have to be computed again: what they are made from has changed. */

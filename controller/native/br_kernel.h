@@ -5,7 +5,8 @@
 #include "bayesrace_mpc.h"
 #include "br_vector.h"
 
-#define BR_GP_BLOCK 128 /* training points that are taken at a time: in the first-level cache */
+/* Training points that are taken at a time: in the first-level cache. */
+#define BR_GP_BLOCK (BR_GP_CAPACITY < 128 ? (BR_GP_CAPACITY + 7) / 8 * 8 : 128)
 #define BR_GP_BLOCKS ((BR_GP_CAPACITY + BR_GP_BLOCK - 1) / BR_GP_BLOCK)
 #define BR_GP_PADDED (BR_GP_BLOCKS * BR_GP_BLOCK)
 /* Training points that the posterior variance is exact with: the memory for it grows with the
@@ -57,10 +58,10 @@ typedef struct {
 
 /* --- br_gp.c --- */
 
-/* Mean and gradient of several stages, at most BR_N. Their weights for br_gp_curvature go into
- * kept, which has room for those of so many stages: (output, block, stage), row by row. */
+/* Mean and gradient of several stages, at most BR_N, into out[s]. Their weights for br_gp_curvature
+ * go into kept, which has room for those of so many stages: (output, block, stage), row by row. */
 BR_PART void br_gp_evaluate(const br_gp *gp, int stages, double (*z)[BR_NZ], br_gp_row *kept,
-                            int room, br_correction *out);
+                            int room, br_correction *const out[]);
 /* Of all stages that kept has room for, out[s] = sum_j weight[s][j] d^2 mu_j / d z^2. */
 BR_PART void br_gp_curvature(const br_gp *gp, int stages, double (*z)[BR_NZ], br_gp_row *kept,
                              const br_correction *const values[], double (*weight)[BR_NE],

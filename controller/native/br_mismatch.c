@@ -302,7 +302,7 @@ double br_mismatch_variance(const br_mpc *mpc, const double phi[BR_NPHI], int ou
 
 void br_mismatch_add(const br_mpc *mpc, const double x[BR_NX], const double u[BR_NU],
                      br_stage *stage) {
-    double error[BR_NE], slope[BR_NE][BR_NV] = {{0}};
+    double error[BR_NE], slope[BR_NE][BR_NV] = {};
     memcpy(stage->plain_f, stage->f, sizeof stage->f);
     memcpy(stage->plain_jacobian, stage->jacobian, sizeof stage->jacobian);
     br_mismatch_terms(x, u, stage->f, 1, stage->phi);

@@ -35,9 +35,9 @@ void br_sqp_shift(br_mpc *mpc) {
     const int last = BR_N - 1, free_slot = mpc->stage[0].slot;
     br_invalidate(mpc, BR_TUBE);
     memmove(mpc->plan.x, mpc->plan.x + 1, BR_N * sizeof mpc->plan.x[0]);
-    memmove(mpc->plan.u, mpc->plan.u + 1, last * sizeof mpc->plan.u[0]);
+    memmove(mpc->plan.u, mpc->plan.u + 1, (size_t)last * sizeof mpc->plan.u[0]);
     memmove(mpc->plan.costate, mpc->plan.costate + 1, BR_N * sizeof mpc->plan.costate[0]);
-    memmove(mpc->stage, mpc->stage + 1, last * sizeof mpc->stage[0]);
+    memmove(mpc->stage, mpc->stage + 1, (size_t)last * sizeof mpc->stage[0]);
     br_qp_shift_rows(mpc->plan.multiplier, sizeof mpc->plan.multiplier[0]);
     br_qp_shift_rows(mpc->qp.sense, sizeof mpc->qp.sense[0]);
     for (int c = 0; c < BR_NU; ++c)

@@ -68,19 +68,20 @@ static BR_APART void stages_linearise(const br_gp *gp, int stages, double (*x)[B
                                       double (*u)[BR_NU], br_gp_row *kernels, int room, int slot,
                                       br_stage *stage) {
     double z[BR_N][BR_NZ];
-    br_correction residual[BR_N];
-    if (gp->any) {
-        for (int k = 0; k < stages; ++k) br_stage_features(x[k], u[k], z[k]);
-        br_gp_evaluate(gp, stages, z, kernels + slot, room, residual);
-    } else {
-        memset(residual, 0, stages * sizeof residual[0]);
+    br_correction *residual[BR_N];
+    for (int k = 0; k < stages; ++k) {
+        residual[k] = &stage[k].residual;
+        if (gp->any)
+            br_stage_features(x[k], u[k], z[k]);
+        else
+            memset(residual[k], 0, sizeof *residual[k]);
     }
+    if (gp->any) br_gp_evaluate(gp, stages, z, kernels + slot, room, residual);
     for (int k = 0; k < stages; ++k) {
         double jacobian[BR_NX][NW];
         br_stage *one = &stage[k];
         one->slot = slot + k;
-        one->residual = residual[k];
-        nominal(x[k], u[k], residual[k].mean, one->f, jacobian[0]);
+        nominal(x[k], u[k], one->residual.mean, one->f, jacobian[0]);
         for (int i = 0; i < BR_NX; ++i) {
             memcpy(one->jacobian[i], jacobian[i], sizeof one->jacobian[i]);
             memcpy(one->in_e[i], jacobian[i] + BR_NV, sizeof one->in_e[i]);
@@ -151,7 +152,7 @@ static void nominal_over(const double x[BR_NX], const double u[BR_NU], const dou
  */
 static void stage_advance(const br_gp *gp, const br_mpc *mismatched, const double x[BR_NX],
                           const double u[BR_NU], double duration, double x_next[BR_NX]) {
-    double z[BR_NZ], mean[BR_NE] = {0}, error[BR_NE], phi[BR_NPHI];
+    double z[BR_NZ], mean[BR_NE] = {}, error[BR_NE], phi[BR_NPHI];
     const double share = duration / BR_TS;
     br_stage_features(x, u, z);
     if (gp && gp->any) br_gp_mean(gp, z, mean);
@@ -258,10 +259,10 @@ br_mpc_error br_propagate(const br_mpc *mpc, const double x[BR_NX], const double
     double acting[BR_NU], mean[BR_NE], unlimited[BR_NX], in_w[BR_NX][BR_NX + BR_NE];
     double z[1][BR_NZ];
     BR_ALIGNED br_gp_row kernels[BR_NE * BR_GP_BLOCKS];
-    br_correction residual = {0};
+    br_correction residual = {};
     BR_CALL(br_acting, BR_LIST(x, u, &duration_s, theta), BR_LIST(acting));
     br_stage_features(begin ? begin : x, acting, z[0]);
-    if (gp->any) br_gp_evaluate(gp, 1, z, kernels, 1, &residual);
+    if (gp->any) br_gp_evaluate(gp, 1, z, kernels, 1, (br_correction *const[]){&residual});
     for (int j = 0; j < BR_NE; ++j)
         mean[j] = share * residual.mean[j] + duration_s * (disturbance ? disturbance[j] : 0);
     BR_CALL(br_transit, BR_LIST(x, acting, mean, &duration_s), BR_LIST(unlimited, in_w[0]));

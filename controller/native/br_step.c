@@ -419,9 +419,7 @@ static void foresee(br_mpc *mpc, double elapsed, int shifts) {
     if (shifts) {
         memcpy(mpc->x0, mpc->plan.x[0], sizeof mpc->x0);
         memcpy(mpc->u_before, mpc->answer_u[shifts - 1], sizeof mpc->u_before);
-    }
 #if BR_HAS_PATH
-    if (shifts) {
         double lateral;
         mpc->path.age += elapsed;
         br_path_project(&mpc->path, mpc->x0, &lateral);
@@ -429,8 +427,9 @@ static void foresee(br_mpc *mpc, double elapsed, int shifts) {
         mpc->follows = may_follow(mpc);
 #endif
         if (!mpc->follows) br_path_plan(&mpc->path, mpc->caution.pace, mpc->reference);
-    }
 #endif
+    }
+    (void)elapsed; /* for a problem without a path */
     br_invalidate(mpc, BR_FOLLOWED);
     br_evaluate_bounds(mpc);
     br_path_follow(mpc);

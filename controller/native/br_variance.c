@@ -45,6 +45,7 @@ static void query(const br_gp_variance *v, int first, int rows, double q[BR_NZ][
         break;
     default:
         query_by(BR_KERNEL_MATERN25, v, first, rows, q, k);
+        break;
     }
 }
 
@@ -159,7 +160,7 @@ static void explain(const br_gp_variance *v, double (*restrict k)[BR_COLUMNS],
                     double explained[BR_COLUMNS]) {
     br_vec total[VECTORS] = {{0}};
     for (int first = 0; first < v->count; first += BR_ROOT_TILE) {
-        const tile_column *restrict rows = (const tile_column *)&v->root[BR_ROOT_SIZE(first)];
+        const tile_column *restrict rows = (const void *)&v->root[BR_ROOT_SIZE(first)];
         for (int half = 0; half < BR_ROOT_TILE; half += ROWS) {
             br_vec t[ROWS][VECTORS] = {{{0}}};
             for (int j = 0; j < first + BR_ROOT_TILE; ++j) {

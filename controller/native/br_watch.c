@@ -35,13 +35,14 @@ static void judge(br_mpc *mpc, const br_sample *sample, br_judged *judged) {
     const int of[2] = {mpc->gp_in_use, mpc->gp_proven};
     for (int which = 0; which < 2; ++which) {
         const br_gp *gp = &mpc->gp[of[which]];
-        double mean[BR_NE] = {0};
+        double mean[BR_NE] = {};
         if (gp->any) br_gp_mean(gp, sample->z, mean);
         for (int j = 0; j < BR_NE; ++j) judged->error[which][j] = sample->residual[j] - mean[j];
     }
 }
 
 void br_watch_update(br_mpc *mpc) {
+    if (BR_WEIGHT_BUFFERS == 1) return; /* there is nothing to compare with, or to go back to */
     br_watch *watch = &mpc->watch;
     if (watch->newest.duration > 0) {
         br_sample *sample = &watch->sample[watch->count % BR_SAMPLES];

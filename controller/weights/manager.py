@@ -8,17 +8,16 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Mapping
-from contextlib import suppress
-from functools import partial
 from queue import Empty, Full, Queue
 from typing import Any, Final
 
 from bayesrace.controller.settings import GateSettings
-from bayesrace.controller.weights.adoption import Adoption, Ruling, Task, WeightsPort
-from bayesrace.controller.weights.checks import Samples, judged
+from bayesrace.controller.weights.adoption import Adopter, AgainError, Ruling, WeightsPort
+from bayesrace.controller.weights.checks import judged
 from bayesrace.controller.weights.store import AcceptedWeights, digest_of
 from bayesrace.defaults import LEAST_LOSS_S
 from bayesrace.errors import InputError
+from bayesrace.manifest import read_manifest
 from bayesrace.messages import ROLLBACK, WEIGHTS, Scalar
 from bayesrace.transport import Request, declare_service, decode_request
 from bayesrace.vehicles import car_text
@@ -29,12 +28,10 @@ _log = logging.getLogger("bayesrace.controller")
 
 _RETURN_S: Final = 5.0
 """Share of a service's time for the adoption, the store, and the way here and back."""
-_TASK_S: Final = 2.0
-"""The control loop, driving or idle, does a task within a cycle or a heartbeat; this is a stall."""
 _END_S: Final = 5.0
 """For the request at hand when the controller ends."""
 _POLL_S: Final = 0.02
-"""Between two looks at what is waited for: the control thread wakes no other thread."""
+"""Between two looks at what the watch has found."""
 
 _MOST_WAITING: Final = 32
 """Requests; each may hold a file."""
@@ -52,7 +49,7 @@ _AGAIN: Final[_Data] = {"again": True}
 class _RefusalError(InputError):
     """A refusal with data."""
 
-    def __init__(self, text: str, data: _Data = _AGAIN) -> None:
+    def __init__(self, text: str, data: _Data) -> None:
         super().__init__(text)
         self.data = data
 
@@ -61,18 +58,19 @@ class WeightUpdateManager:
     """Runs from :meth:`start` to :meth:`stop`."""
 
     def __init__(
-        self, session: Any, name: str, port: WeightsPort, settings: GateSettings,
-        announce: Callable[[str, str, _Data], None],
+        self, session: Any, name: str, port: WeightsPort, adoption: Adopter,
+        settings: GateSettings, announce: Callable[[str, str, _Data], None],
     ) -> None:  # fmt: skip
         """``announce`` publishes an event (kind, text, data)."""
         self._port, self._history, self._settings = port, port.history, settings
-        self._announce, self.adoption = announce, Adoption(port, settings)
+        self._announce, self.adoption = announce, adoption
+        adoption.ruled = self._enter
         self.text = ""
         """What is wrong; empty while all is well."""
         self._counts = dict.fromkeys(("accepted", "refused", "rolled_back"), 0)
         self._counting, self._stopping = threading.Lock(), False
         self._waiting: Queue[tuple[float, int, Request]] = Queue(_MOST_WAITING)
-        self._most_bytes = 3 * 8 * 7 * (port.step.manifest.gp_capacity + 1) + _FILE_BYTES
+        self._most_bytes = 3 * 8 * 7 * (read_manifest(port.artefact).gp_capacity + 1) + _FILE_BYTES
         self._thread = threading.Thread(target=self._run, name="weights", daemon=True)
         self._name = name
         self.bind(session)
@@ -124,7 +122,7 @@ class WeightUpdateManager:
     def _run(self) -> None:
         while not self._stopping:
             try:
-                self._follow()
+                self.adoption.follow()
                 self._serve(*self._waiting.get(timeout=_POLL_S))
             except Empty:
                 continue
@@ -133,13 +131,15 @@ class WeightUpdateManager:
 
     def _serve(self, arrived_s: float, reverted: int, request: Request) -> None:
         """From a request to its answer; ``reverted``: as often the watch had gone back before."""
-        self._follow()
+        self.adoption.follow()
         due_s = arrived_s + request.service.timeout_s - _RETURN_S
         accepted, text, data = False, "a fault of the controller's own: see its log", _AGAIN
         try:
             serve = self._update if request.service is WEIGHTS else self._back
             text, data = serve(request, reverted, due_s)
             accepted = True
+        except AgainError as refusal:
+            text = str(refusal)
         except InputError as refusal:
             text, data = str(refusal), getattr(refusal, "data", {})
         finally:
@@ -159,12 +159,12 @@ class WeightUpdateManager:
         if not verdict["packed"]:
             raise _RefusalError(verdict["text"], verdict["data"])
         version, packed = verdict["data"]["version"], verdict["packed"]
-        cycle = self._adopt(packed, version, watched, reverted)
+        cycle = self.adoption.adopt(packed, version, watched, reverted)
         new = history.accept(version, data, packed, proven=not watched)
         self._counts["accepted"] += 1
         in_use = f"in use from cycle {cycle} on, as number {new.number}"
         text = f"weights {new.version} {in_use}; {verdict['text']}"
-        unknown_s = self._port.step.unknown_s
+        unknown_s = self.adoption.unknown_s
         if unknown_s >= LEAST_LOSS_S:
             where = "where the line is faster than what they have learned"
             text += f"; {unknown_s:.2f} s a lap are lost {where}: train on a track with such bends"
@@ -178,7 +178,7 @@ class WeightUpdateManager:
 
     def _judge(self, data: bytes, reverted: int, due_s: float) -> Any:
         """The verdict of another process, by what is in use now."""
-        recent = Samples(*self._ask(self._port.step.samples, reverted)[1])
+        recent = self.adoption.samples(reverted)
         in_use = self._history.in_use
         question = {
             "artefact": str(self._port.artefact), "car": car_text(self._port.car),
@@ -190,7 +190,7 @@ class WeightUpdateManager:
         try:
             return judged(question, due_s)
         except InputError as error:
-            raise _RefusalError(f"{error}; send them again") from None
+            raise AgainError(f"{error}; send them again") from None
 
     def _back(self, request: Request, reverted: int, due_s: float) -> _Answer:
         """Returns to the weights before those in use."""
@@ -206,8 +206,8 @@ class WeightUpdateManager:
         history.roll_back(target, withdraw=False)
         if not target.proven:  # the watch over it goes back to what was proven then
             proven = history.reference
-            self._adopt(proven.packed, proven.version, False, reverted)
-        cycle = self._adopt(target.packed, target.version, not target.proven, reverted)
+            self.adoption.adopt(proven.packed, proven.version, False, reverted)
+        cycle = self.adoption.adopt(target.packed, target.version, not target.proven, reverted)
         why = f"on request: {message.text}"
         return self._kept(*self._rolled_back(target, "request", why, cycle))
 
@@ -230,45 +230,16 @@ class WeightUpdateManager:
             _log.warning("%s", error)
             self._announce("weights_not_kept", self.text, {})
 
-    # Adoption and watch --------------------------------------------------------------------------
-
-    def _adopt(self, packed: bytes, version: str, watched: bool, reverted: int) -> int:
-        """Stages weights and waits until the control thread has adopted them; their first cycle."""
-        self._port.step.stage_weights(packed)
-        return self._ask(partial(self.adoption.adopt, version, watched), reverted)[0]
-
-    def _ask(self, work: Callable[[], Any], reverted: int) -> tuple[int, Any]:
-        """Has the control thread do something: the number of the next cycle, and the result."""
-        task, until_s = Task(work, reverted), time.monotonic() + _TASK_S
-        self.adoption.tasks.append(task)
-        while (cycle := self._follow()) is None:
-            if time.monotonic() > until_s:
-                with suppress(IndexError):  # else the control thread is just doing it
-                    self.adoption.tasks.pop()
-                    why_not = f"the control loop did not take them over within {_TASK_S:g} s"
-                    raise _RefusalError(why_not)
-            time.sleep(_POLL_S)
-        if task.error:
-            raise _RefusalError(task.error)
-        return cycle, task.result
-
-    def _follow(self) -> int | None:
-        """Records the watch's rulings in the history, up to the task that is done, if one is: its
-        cycle. Later rulings are about weights just adopted, which are not in the history yet."""
-        while self.adoption.done:
-            cycle, what = self.adoption.done.popleft()
-            if isinstance(what, Task):
-                return cycle
-            self._enter(cycle, what)
-        return None
+    # Watch ---------------------------------------------------------------------------------------
 
     def _enter(self, cycle: int, ruling: Ruling) -> None:
+        """Records a ruling of the watch in the history."""
         in_use = self._history.in_use
         known: _Data = {
             "version": in_use.version, "number": in_use.number, "cycle": cycle,
         }  # fmt: skip
         if ruling.action == "slow":
-            limit_mps = self.adoption.slow.speed_limit_mps if self.adoption.slow else 0.0
+            limit_mps = ruling.limit_mps
             text = f"at most {limit_mps:.2f} m/s until other weights are in use"
             data = {**ruling.data, **known, "speed_limit_mps": limit_mps}
             self._announce("weights_slowed", f"{text}; {in_use.version} {ruling.text}", data)

@@ -48,7 +48,7 @@ from bayesrace.tracks import PathProjection, Track
 from bayesrace.tracks.spline import CentrelineSearch, PlaneSpline
 from bayesrace.vehicles import Car
 
-__all__ = ["DrivenRun", "RaceAnalysis", "read_race"]
+__all__ = ["DrivenRun", "RaceAnalysis", "line_offset", "read_race"]
 
 
 _SURELY: Final = 1.5
@@ -61,7 +61,7 @@ _WEIGHTS_FILES: Final = {
 }
 
 
-def _line_offset(line: RaceLine, xy: Floats, reach_m: float) -> Floats:
+def line_offset(line: RaceLine, xy: Floats, reach_m: float) -> Floats:
     """Signed distance (n,) of a trajectory (n, 2) from the racing line, positive to its left."""
     curve = PlaneSpline(line.s_m, line.xy_m, line.length_m)
     s = CentrelineSearch(curve, reach_m / 16).follow(xy, None, reach_m)
@@ -92,7 +92,7 @@ class DrivenRun:
         self.on_track: PathProjection = track.project_path(xy)
         self.laps = time_laps(track, record.time_s, xy, self.on_track.s_m)
         reach_m = float(np.max(track.width_right_m + track.width_left_m))
-        self.offset_m = _line_offset(line, xy, reach_m)
+        self.offset_m = line_offset(line, xy, reach_m)
 
     @property
     def finished(self) -> bool:
@@ -146,7 +146,7 @@ class DrivenRun:
         depth = self.on_track.off_track_m[self.counted]
         between = self.off_track_between()
         deviation = np.abs(self.offset_m[self.counted])
-        times = self.laps.times_s
+        times, solve_us = self.laps.times_s, self.record.telemetry["solve_us"]
         return LapResult(
             controller=self.controller,
             number=self.number,
@@ -165,7 +165,7 @@ class DrivenRun:
             lateral_max_mps2=self._largest(self.record.lateral_mps2),
             slip_max_rad=self._largest(self.record.slip_rad),
             speed_max_mps=self._largest(self.record.x[:, 3]),
-            solve_us=_percentiles(self.record.telemetry["solve_us"]),
+            solve_us=Percentiles.of(solve_us) if len(solve_us) else None,
             cycles=cycles.counts,
             sensor_faults=cycles.sensor_faults,
             passed=verdict.passed,
@@ -191,13 +191,6 @@ def _ratios(times_s: Sequence[float], limit_s: Mapping[str, float]) -> list[floa
     if not set(kinds) <= set(limit_s):
         return None
     return [time / limit_s[kind] for time, kind in zip(times_s, kinds, strict=False)]
-
-
-def _percentiles(values: Floats) -> Percentiles | None:
-    if not len(values):
-        return None
-    p50, p99, largest = np.percentile(values, [50, 99, 100])
-    return Percentiles(p50=float(p50), p99=float(p99), max=float(largest))
 
 
 def _training_run(found: TrainingRecord | None) -> DrivenRun | None:

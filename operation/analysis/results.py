@@ -2,10 +2,12 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Literal
+from typing import Literal, Self
 
+import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from bayesrace.arrays import Floats
 from bayesrace.defaults import LEAST_LOSS_S
 from bayesrace.errors import InputError, faults_in
 from bayesrace.files import read_whole, write_whole
@@ -15,6 +17,7 @@ __all__ = [
     "LapResult",
     "Percentiles",
     "RaceResult",
+    "ResultModel",
     "SettingsSummary",
     "gp_metrics",
     "read_result",
@@ -22,20 +25,28 @@ __all__ = [
 ]
 
 
-class _Frozen(BaseModel):
-    # Numbers that are not finite have no place in JSON: what is not known is null.
+class ResultModel(BaseModel):
+    """What is written as JSON. Numbers that are not finite have no place there: what is not known
+    is null."""
+
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
-class Percentiles(_Frozen):
-    """Execution time of the controller's step over all cycles of a run [us]."""
+class Percentiles(ResultModel):
+    """Of numbers, such as the execution times of the controller's steps."""
 
     p50: float
     p99: float
     max: float
 
+    @classmethod
+    def of(cls, values: Floats) -> Self:
+        """Those of at least one number."""
+        p50, p99, most = np.percentile(values, [50, 99, 100]).tolist()
+        return cls(p50=p50, p99=p99, max=most)
 
-class LapResult(_Frozen):
+
+class LapResult(ResultModel):
     """One driven controller. Samples count up to the last counted crossing of the start line."""
 
     controller: str = Field(description="worstcase, bayesrace, bayesrace-updated, bestcase, …")
@@ -70,7 +81,9 @@ class LapResult(_Frozen):
         None, description="largest angle between the car's axis and its velocity"
     )
     speed_max_mps: float | None = Field(None, description="largest speed along the car's axis")
-    solve_us: Percentiles | None = Field(description="null without telemetry")
+    solve_us: Percentiles | None = Field(
+        description="execution times of the controller's step [us]; null without telemetry"
+    )
     cycles: dict[str, int] = Field(
         description="number of the controller's cycles at each level: solution, and of the "
         "fallback shifted_plan, brake, stop"
@@ -118,7 +131,7 @@ class LapResult(_Frozen):
         return self.controller if self.number is None else f"{self.controller} {self.number}"
 
 
-class GpMetrics(_Frozen):
+class GpMetrics(ResultModel):
     """How well one output's GP predicts the residual of a drive, SI units."""
 
     rmse: float
@@ -133,7 +146,7 @@ def gp_metrics(metrics: Mapping[str, Mapping[str, float]]) -> dict[str, GpMetric
     return {output: GpMetrics.model_validate(dict(one)) for output, one in metrics.items()}
 
 
-class SettingsSummary(_Frozen):
+class SettingsSummary(ResultModel):
     """What was raced; ``settings.json`` has all of it."""
 
     car: str
@@ -148,7 +161,7 @@ class SettingsSummary(_Frozen):
     fmu: str = Field("", description="what simulated the car; empty: the built-in equations")
 
 
-class RaceResult(_Frozen):
+class RaceResult(ResultModel):
     """``result.json``: made from a run directory by :mod:`bayesrace.operation.analysis.race`."""
 
     settings: SettingsSummary

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
@@ -13,7 +13,7 @@ from bayesrace.gp.weights import Weights
 from bayesrace.learning.dataset import Dataset, left_out
 from bayesrace.learning.sources import read_samples
 from bayesrace.learning.validation import HORIZON, Validation, discretisation_of, mismatch, validate
-from bayesrace.operation.analysis.results import GpMetrics, gp_metrics
+from bayesrace.operation.analysis.results import GpMetrics, ResultModel, gp_metrics
 from bayesrace.operation.terminal import UNCERTAIN
 from bayesrace.vehicles import Car, get_car
 
@@ -23,11 +23,7 @@ DRIFTS: Final = "position_m", "heading_rad", "vx_mps", "vy_mps", "omega_radps"
 """Errors of a prediction, with their units."""
 
 
-class _Frozen(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
-
-class Spread(_Frozen):
+class Spread(ResultModel):
     """Of absolute errors over all predictions."""
 
     mean: float
@@ -46,7 +42,7 @@ def _drift(errors: Floats) -> dict[str, Spread]:
     return found
 
 
-class HorizonResult(_Frozen):
+class HorizonResult(ResultModel):
     """Open-loop predictions over some steps, without and with the correction."""
 
     steps: int
@@ -55,7 +51,7 @@ class HorizonResult(_Frozen):
     corrected: dict[str, Spread]
 
 
-class ValidationResult(_Frozen):
+class ValidationResult(ResultModel):
     """What ``--json`` writes."""
 
     vx: GpMetrics

@@ -21,7 +21,7 @@ from typer.main import get_command
 
 from bayesrace.errors import PASSING, InputError, RestartError, faults_in
 from bayesrace.operation.cli.declaration import Group, configured
-from bayesrace.processes import remembering_interrupts
+from bayesrace.processes import interrupt_cause, remembering_interrupts
 
 __all__ = ["app", "main"]
 
@@ -32,20 +32,23 @@ _EXTRAS: Final = {
     "fmu": ("fmpy",),
     "race": (
         "PIL", "casadi", "contourpy", "jinja2", "lz4", "matplotlib", "mcap", "rich",
-        "scipy", "sklearn", "threadpoolctl", "yaml", "zstandard",
+        "scipy", "sklearn", "threadpoolctl", "websockets", "yaml", "zstandard",
     ),
     "campaign": ("bokeh", "dask", "distributed", "optuna", "pandas", "pyarrow"),
+    "foxglove": ("foxglove",),
+    "ros2": ("rosbags",),
     "slipx": ("slipx",),
 }  # fmt: skip
 """Modules that the extras of pyproject.toml install."""
 
 _TASKS: Final = {
-    "Race": "race.race race.report",
+    "Race": "race.race race.report view.view",
     "Prepare": "tracks.tracks tracks.cars tracks.raceline learning.collect "
-    "learning.identify learning.train learning.validate export.build",
+    "learning.import_drive learning.identify learning.train learning.validate export.size "
+    "export.build",
     "Drive": "processes.plant processes.controller processes.bridge race.drive processes.status "
-    "processes.stop processes.go processes.router processes.doctor configuration.config "
-    "configuration.certs",
+    "processes.stop processes.go processes.router processes.doctor processes.ros2 "
+    "configuration.config configuration.certs",
     "Learn while driving": "learning.learn learning.publish learning.rollback",
     "Measure": "tracks.limit race.bench race.latency race.paper",
     "Evidence": "evidence.replay evidence.scenario evidence.shadow evidence.timing",
@@ -160,16 +163,22 @@ def main() -> None:
                 raise KeyboardInterrupt
         sys.exit(code)
     except (typer.Abort, KeyboardInterrupt):
-        _fail("interrupted", _INTERRUPTED)
+        cause = interrupt_cause()
+        _fail(str(cause or "interrupted"), _code(cause) if cause else _INTERRUPTED)
     except Exception as error:
         text = _in_words(error)
         if text is None:
             raise
-        ours = isinstance(error, RuntimeError) and not isinstance(error, RecursionError)
-        system = error.__cause__ if isinstance(error, InputError) else error
-        passes = isinstance(system, OSError) and system.errno in PASSING
-        restart = passes or isinstance(error, RestartError)
-        _fail(text, _RESTART if restart else 1 if ours else 2)
+        _fail(text, _code(error))
+
+
+def _code(error: Exception) -> int:
+    """The exit code."""
+    ours = isinstance(error, RuntimeError) and not isinstance(error, RecursionError)
+    system = error.__cause__ if isinstance(error, InputError) else error
+    passes = isinstance(system, OSError) and system.errno in PASSING
+    restart = passes or isinstance(error, RestartError)
+    return _RESTART if restart else 1 if ours else 2
 
 
 def _in_words(error: Exception) -> str | None:

@@ -1,8 +1,9 @@
-"""``build``, ``export``, ``fmu``: the controller, and what other programs exchange with us."""
+"""``size``, ``build``, ``export``, ``fmu``: the controller, and what others exchange with us."""
 
 import shutil
+from math import ceil
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Final, Literal
 
 import typer
 
@@ -20,16 +21,19 @@ if TYPE_CHECKING:
     from bayesrace.tracks import Track
     from bayesrace.vehicles import Car
 
-__all__ = ["build", "export", "fmu"]
+__all__ = ["build", "export", "fmu", "size"]
+
+_CHOICES: Final = "model problem horizon gp_capacity path_rows weight_buffers estimator car"
 
 
-@options_of("bayesrace.codegen.settings.BuildSettings", "model problem horizon gp_capacity car")
+@options_of("bayesrace.codegen.settings.BuildSettings", _CHOICES)
 def build(
     settings: "Given[BuildSettings]",
     out: Path | None = options.out_folder("Copy the artefact here."),
     platform: str | None = options.value(
         "What it is to run on: x86_64-linux, aarch64-linux, aarch32-linux (ARMv7) or "
-        "riscv64-linux; others than this one need --daqp, and ziglang or CC.",
+        "riscv64-linux; others than this one need --daqp, and ziglang or CC. cortex-m7: here, with "
+        "a static library for that processor beside it.",
         shown="this one",
     ),
     daqp: Path | None = options.value(
@@ -39,20 +43,31 @@ def build(
     host: bool = options.flag("--host", "Add the controller without Python: a program."),
 ) -> None:
     """Generate and compile a controller, or take it from the cache; prints its folder."""
+    from bayesrace.codegen.boards import BOARDS, add_library, board_compiler
     from bayesrace.codegen.build import artefact_compiler
     from bayesrace.codegen.build import build as make
+    from bayesrace.codegen.compiler import find_compiler
+    from bayesrace.codegen.daqp import HOW_TO_GET
     from bayesrace.codegen.platforms import get_platform
     from bayesrace.integrators import PERFECT
 
     chosen = settings()
     if chosen.model == "dynamic":
         chosen = settings(discretisation=PERFECT)
-    if host and out is None:
-        raise InputError("--host: the program goes into the folder of --out; give one")
+    board = BOARDS.get(platform or "")
+    if (host or board) and out is None:
+        what = f"--platform {platform}: the library" if board else "--host: the program"
+        raise InputError(f"{what} goes into the folder of --out; give one")
+    if board and daqp is None:
+        raise InputError(f"for {board.name}, DAQP's C is missing: {HOW_TO_GET}")
+    if board and host:
+        raise InputError(f"--host: {board.name} runs no programs; leave it out")
+    cross = board_compiler(board) if board else None
     if out is not None:
         trusted(out, make=True)  # now, as its loader would refuse it after the work
-    target = None if platform is None else get_platform(platform)
-    folder, _ = make(chosen, platform=target, daqp=daqp)
+    target = None if platform is None or board else get_platform(platform)
+    own = find_compiler(by_name=True) if board else None  # CC is that of the board
+    folder, _ = make(chosen, platform=target, daqp=daqp, compiler=own)
     if out is not None:
         shutil.copytree(folder, out, dirs_exist_ok=True, copy_function=_replace)
         folder = out
@@ -60,7 +75,23 @@ def build(
         from bayesrace.operation.host import write_program
 
         write_program(folder, folder, artefact_compiler(target, daqp))
+    if board and cross:
+        typer.echo(add_library(folder, board, cross))
     typer.echo(f"{folder}")
+
+
+@options_of("bayesrace.codegen.settings.BuildSettings", _CHOICES)
+def size(settings: "Given[BuildSettings]") -> None:
+    """Print what a controller would take of memory, without building it."""
+    from bayesrace.codegen.boards import WHOLE, planned_memory
+    from bayesrace.operation.terminal.terminal import Terminal, plain_table
+
+    memory = planned_memory(settings())
+    table = plain_table("memory", "kB")
+    for what, taken in memory.items():
+        table.add_row(what if what in WHOLE else f"  {what}", f"{taken / 1000:.0f}")
+    table.add_row("together", f"{sum(memory[what] for what in WHOLE) / 1000:.0f}")
+    Terminal().print(table)
 
 
 def _replace(source: str, target: str) -> None:
@@ -102,6 +133,7 @@ def _controller(
 ) -> "tuple[Path, Car, Track, RaceLine, Weights | None, MpcSettings]":
     """A controller's artefact and what it drives by."""
     from bayesrace.codegen.build import build as make
+    from bayesrace.codegen.build import checking_artefact
     from bayesrace.codegen.settings import BuildSettings
     from bayesrace.controller.assembly import read_checked, read_settings
     from bayesrace.controller.settings import MpcSettings
@@ -111,15 +143,17 @@ def _controller(
     course = load_track(track or car.race_track, car.width_m)
     line = read_raceline_for(raceline, course, car) if raceline else racing_line(course, car)
     folder = artefact or make(BuildSettings(car=car))[0]
-    learned = None if weights is None else read_checked(weights, folder, car)
+    learned = None
+    if weights is not None:
+        learned = read_checked(weights, checking_artefact(folder, car), car)
     return folder, car, course, line, learned, read_settings(mpc, MpcSettings)
 
 
 def export_fmu(
     out: Path = options.out_file(...),
     car: str = options.CAR,
-    version: Literal["2", "3"] = options.value(
-        "Version of the FMI standard: 2 or 3.", "3", metavar="FMI"
+    version: Literal["2", "3"] | None = options.value(
+        "Version of the FMI standard: 2 or 3.", metavar="FMI", shown="3; with --ssp 2"
     ),
     kind: Literal["cs", "me"] = options.value(
         "cs: Co-Simulation; me: Model Exchange (the car, FMI 3.0).", "cs"
@@ -131,40 +165,55 @@ def export_fmu(
         shown="this one",
     ),
     controller: bool = options.flag("--controller", "Export the controller instead of the car."),
+    ssp: bool = options.flag("--ssp", "Export both, connected, in one file: an SSP 1.0."),
     track: str = options.TRACK,
     raceline: Path | None = options.GIVEN_LINE,
     weights: Path | None = options.WEIGHTS,
     mpc: Path | None = options.MPC,
     artefact: Path | None = options.ARTEFACT,
 ) -> None:
-    """Write the car, or the controller of a track, as an FMU, C sources inside.
+    """Write the car, or the controller of a track, as an FMU, C sources inside; or both (--ssp).
 
-    The options below --controller are for the controller alone.
+    The options below --ssp are for the controller.
     """
-    from bayesrace.codegen.fmu import car_fmu, controller_fmu, pack
+    from bayesrace.codegen.fmu import car_fmu, controller_fmu, pack, pack_loop
     from bayesrace.controller.settings import FallbackSettings
     from bayesrace.vehicles import get_car
 
     parameters = get_car(car)
-    number: Literal[2, 3] = 2 if version == "2" else 3
+    number: Literal[2, 3] = 2 if ssp or version == "2" else 3
     own = {
         "--track": track, "--raceline": raceline, "--weights": weights, "--settings": mpc,
         "--artefact": artefact,
     }  # fmt: skip
-    if not controller:
+    if ssp and (controller or version == "3"):
+        raise InputError(
+            "an SSP holds car and controller, in FMI 2.0: leave out --controller and --version 3"
+        )
+    if not (controller or ssp):
         if given := [flag for flag, value in own.items() if value]:
-            raise InputError(f"{', '.join(given)}: for a controller's FMU; add --controller")
+            raise InputError(f"{', '.join(given)}: for a controller's FMU; add --controller, --ssp")
         definition = car_fmu(parameters, number, kind)
     elif kind == "me":
         raise InputError("a controller is sampled, not continuous: export it with --kind cs")
     else:
         from bayesrace.operation.host import drives_by
+        from bayesrace.operation.run_plan import RunPlan
 
         chosen = _controller(parameters, track, raceline, weights, mpc, artefact)
         fallback = FallbackSettings().model_dump() | {"brake_fade_mps": parameters.brake_fade_mps}
         definition = controller_fmu(
             chosen[0], parameters, **drives_by(*chosen), fallback=fallback, version=number
         )
+        if ssp:
+            course, line = chosen[2:4]
+            pack_loop(
+                car_fmu(parameters, number), definition, out,
+                x0=(*course.start_pose(), RunPlan.start_speed_mps, 0.0, 0.0, 0.0),
+                stop_s=ceil(2 * line.lap_time_s) + 2, platforms=platform or None,
+            )  # fmt: skip
+            typer.echo(f"{parameters.name} and its controller, SSP 1.0: {out}")
+            return
     pack(definition, out, platform or None)
     typer.echo(f"{definition.name}, FMI {number}.0 {kind}: {out}")
 

@@ -253,13 +253,13 @@ def campaign(
     What is there already is not computed again: the same command goes on after an interruption.
     Leaves laps.parquet and report.html.
     """
+    folder = out or Path("runs") / plan.stem
     if scenario is not None:
         from bayesrace.operation.cli.evidence import drive_and_judge
         from bayesrace.studies.evidence.scenario.run import read_grid
 
         if scheduler is not None or again:
             raise InputError("--scenario is driven anew, here: leave out --scheduler and --again")
-        folder = out or Path("runs") / plan.stem
         drive_and_judge(read_grid(plan, scenario), folder, None, workers)
         return
     from bayesrace.operation.terminal.terminal import Terminal
@@ -269,7 +269,6 @@ def campaign(
 
     remote = _remote(scheduler, key)
     read = read_plan(plan)
-    folder = out or Path("runs") / plan.stem
     console = Terminal()
     outcome = run_campaign(read, folder, console, remote, workers, again)
     console.print(f"{len(read.cases)} cases; computed now: {outcome}", highlight=False)

@@ -11,7 +11,8 @@ from rich.console import Console
 from rich.text import Text
 
 from bayesrace.operation.learn.records import LapRecord, Record, UpdateRecord
-from bayesrace.operation.report.style import INK, MUTED, WARNING, figure_style, look, write_png
+from bayesrace.operation.look import look
+from bayesrace.operation.report.style import INK, MUTED, WARNING, figure_style, write_png
 from bayesrace.operation.terminal.terminal import Terminal, plain_table
 
 __all__ = ["draw", "print_laps"]

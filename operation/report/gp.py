@@ -13,6 +13,7 @@ from bayesrace.gp.weights import OUTPUTS, UNITS
 from bayesrace.learning.dataset import Dataset
 from bayesrace.learning.validation import Validation, unbroken
 from bayesrace.operation.analysis.validation import Validated
+from bayesrace.operation.look import look
 from bayesrace.operation.report.maps import draw_edges, show_all
 from bayesrace.operation.report.style import (
     INK,
@@ -20,7 +21,6 @@ from bayesrace.operation.report.style import (
     PICTURE_WIDTH,
     WARNING,
     figure_style,
-    look,
     panel,
     write_png,
 )

@@ -5,14 +5,8 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from bayesrace.learning.identification import Comparison
-from bayesrace.operation.report.style import (
-    INK,
-    MUTED,
-    PICTURE_WIDTH,
-    figure_style,
-    look,
-    write_png,
-)
+from bayesrace.operation.look import look
+from bayesrace.operation.report.style import INK, MUTED, PICTURE_WIDTH, figure_style, write_png
 from bayesrace.vehicles import Car
 
 __all__ = ["write_comparison"]

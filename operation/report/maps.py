@@ -1,15 +1,14 @@
-"""Tracks: with laps by speed or by where they gain and lose time on the reference lap, or alone
-with the map that they were made of, to check them by."""
+"""Tracks: with laps by speed, or alone with the map that they were made of, to check them by."""
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection
-from matplotlib.colors import Colormap, Normalize
+from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Polygon
 from matplotlib.transforms import Affine2D
@@ -18,7 +17,7 @@ from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
 from bayesrace.files import write_whole
 from bayesrace.operation.analysis.race import DrivenRun
-from bayesrace.operation.report.panels import Lap, first_laps, reference_of
+from bayesrace.operation.look import look
 from bayesrace.operation.report.style import (
     INK,
     MUTED,
@@ -27,9 +26,7 @@ from bayesrace.operation.report.style import (
     SURFACE,
     WARNING,
     figure_style,
-    gain_map,
     inline_svg,
-    look,
     speed_map,
     write_png,
 )
@@ -53,51 +50,18 @@ _EDGE: Final = "#0072B2"
 _SHADES: Final = {"free": 255, "unknown": 200, "occupied": 90}
 
 
-class _Shade(NamedTuple):
-    """A quantity by which a lap is coloured."""
-
-    values: Floats
-    norm: Normalize
-    colours: Colormap
-    label: str
-
-
 def lap_maps(runs: Sequence[DrivenRun], track: Track, line: RaceLine) -> list[Figure]:
-    """The first lap of each run on the track, later laps as a thin line.
+    """The first lap of each run on the track, coloured by speed; later laps as a thin line.
 
-    A lap that finished is coloured by the time that it loses on each metre to the reference lap;
-    the reference itself, and a run without a lap, by speed. Off-track samples are those that the
-    result table counts; a run without a lap is shown until the car left out a piece of the track.
+    Off-track samples are those that the result table counts; a run without a lap is shown until the
+    car left out a piece of the track.
     """
-    laps = {lap.run: lap for lap in first_laps(runs, track) if lap.run.finished}
-    reference = reference_of(list(laps.values()))
-    losses = {
-        lap.run: _loss(lap, reference)
-        for lap in laps.values()
-        if reference is not None and lap is not reference
-    }
-    size = np.concatenate([np.zeros(1), *(np.abs(loss) for loss in losses.values())])
-    limit = float(np.percentile(size, 95)) or 1.0
     top = [float(np.max(run.record.x[run.counted, 3], initial=0.0)) for run in runs]
     speed = Normalize(0.0, max([*top, float(line.vx_mps.max())]))
-    figures = []
-    for run in runs:
-        if run in losses:
-            loss = Normalize(-limit, limit)
-            shade = _Shade(losses[run], loss, gain_map(), "time lost [ms/m]")
-        else:
-            shade = _Shade(run.record.x[run.shown(), 3], speed, speed_map(), "speed vx [m/s]")
-        figures.append(_lap_map(run, track, line, shade))
-    return figures
+    return [_lap_map(run, track, line, speed) for run in runs]
 
 
-def _loss(lap: Lap, reference: Lap) -> Floats:
-    """Time lost on each metre at the samples of a lap [ms/m]."""
-    s, behind_s = lap.behind(reference)
-    return np.interp(lap.s_m, s, 1e3 * np.gradient(behind_s, s))
-
-
-def _lap_map(run: DrivenRun, track: Track, line: RaceLine, shade: _Shade) -> Figure:
+def _lap_map(run: DrivenRun, track: Track, line: RaceLine, speed: Normalize) -> Figure:
     """A map and its scale, at fixed places: a layout by what is drawn would draw everything
     twice."""
     edges = track.boundaries(0.04)
@@ -125,10 +89,11 @@ def _lap_map(run: DrivenRun, track: Track, line: RaceLine, shade: _Shade) -> Fig
     axes.plot(everything[:, 0], everything[:, 1], color=MUTED, linewidth=0.6)
     points = run.record.x[run.shown(), :2]
     trace = LineCollection(
-        list(np.stack([points[:-1], points[1:]], axis=1)), cmap=shade.colours, norm=shade.norm,
+        list(np.stack([points[:-1], points[1:]], axis=1)), cmap=speed_map(), norm=speed,
         linewidth=2.4, capstyle="round",
     )  # fmt: skip
-    trace.set_array((shade.values[:-1] + shade.values[1:]) / 2)
+    speeds = run.record.x[run.shown(), 3]
+    trace.set_array((speeds[:-1] + speeds[1:]) / 2)
     axes.add_collection(trace)
     off = everything[run.off_track[counted]]
     axes.plot(off[:, 0], off[:, 1], "x", color=WARNING, markersize=3.6, zorder=5)
@@ -138,7 +103,7 @@ def _lap_map(run: DrivenRun, track: Track, line: RaceLine, shade: _Shade) -> Fig
     axes.set_title(name, color=colour, fontweight="bold")
     axes.set_title(f"{time} · {int(run.off_track.sum())} off track", loc="right", color=INK)
     scale = place(0.1 + wide, 0.05 + 0.2 * tall, 0.11, 0.6 * tall)
-    bar = figure.colorbar(ScalarMappable(shade.norm, shade.colours), cax=scale, label=shade.label)
+    bar = figure.colorbar(ScalarMappable(speed, speed_map()), cax=scale, label="speed vx [m/s]")
     bar.outline.set_visible(False)
     return figure
 

@@ -16,13 +16,17 @@ from bayesrace.files import write_whole
 from bayesrace.manifest import Manifest
 from bayesrace.operation.analysis.race import RaceAnalysis, read_race
 from bayesrace.operation.analysis.results import RaceResult, write_result
+from bayesrace.operation.look import look
 from bayesrace.operation.report.coverage import coverage_figures
 from bayesrace.operation.report.gp import gp_figures
 from bayesrace.operation.report.maps import lap_maps
-from bayesrace.operation.report.panels import lap_figures, solve_figure, time_figures
-from bayesrace.operation.report.style import figure_style, inline_svg, look
+from bayesrace.operation.report.panels import cornering_figure, solve_figure
+from bayesrace.operation.report.style import figure_style, inline_svg
 from bayesrace.operation.terminal import UNCERTAIN
 from bayesrace.operation.terminal.tables import COLUMNS, GP_COLUMNS, drive_text, gp_cells
+from bayesrace.operation.view.errors import StepErrors
+from bayesrace.operation.view.page import page_part
+from bayesrace.operation.view.sources import Source, all_updates
 from bayesrace.processes import raise_if_interrupted
 
 __all__ = ["REPORT", "RESULT", "template", "write_report"]
@@ -37,7 +41,7 @@ _PACKAGES: Final = ("bayesrace", "casadi", "numpy", "scipy", "eclipse-zenoh")
 def write_report(run_dir: Path, analysis: RaceAnalysis | None = None) -> Path:
     """Writes ``result.json`` and ``report.html`` into the run directory; returns the page's path.
 
-    ``analysis`` saves reading the log a second time. Nothing is written before everything has been
+    ``analysis`` saves computing it a second time. Nothing is written before everything has been
     computed and drawn: an earlier report stays as it is otherwise. InputError if it is no run
     directory.
     """
@@ -70,7 +74,18 @@ def _page(run_dir: Path, analysis: RaceAnalysis, figures: Mapping[str, Sequence[
         limit_sigma=UNCERTAIN,
         caution=analysis.recording.settings.mpc.caution,
         title=f"{result.settings.track} · {analysis.track.length_m:.2f} m",
+        view=_view(run_dir, analysis),
     )
+
+
+def _view(run_dir: Path, analysis: RaceAnalysis) -> str:
+    """The laps over the track, to go through; empty if none was driven."""
+    car, title = analysis.recording.settings.car, analysis.track.name
+    errors = StepErrors(run_dir, car)
+    source = Source(run_dir / "run.mcap", analysis.track, analysis.line, car, title, errors)
+    source.read_all()
+    updates = all_updates(source)
+    return page_part(updates, embedded=True) if len(updates) > 1 else ""
 
 
 def template(name: str, folder: Path | None = None) -> Template:
@@ -141,11 +156,8 @@ def _figures(analysis: RaceAnalysis) -> Iterator[tuple[str, list[Figure]]]:
     """The figures of each section of the page."""
     runs = [run for run in analysis.runs if len(run.record.truth) > 1]
     recording, track, line = analysis.recording, analysis.track, analysis.line
-    yield "laps", lap_maps(runs, track, line)
     if runs:
-        yield "time", time_figures(runs, track)
-        friction = analysis.result.settings.friction
-        yield from lap_figures(runs, track, line, recording.settings.car, friction).items()
+        yield "cornering", [cornering_figure(runs, track, analysis.result.settings.friction)]
     data = analysis.best_case
     if data is not None and analysis.validations:
         progress = track.project_path(data.x[:, :2]).progress_m

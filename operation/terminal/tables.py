@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from bayesrace.gp.weights import OUTPUTS, UNITS
+from bayesrace.gp.weights import OUTPUTS, UNITS, pack_weights
 from bayesrace.learning.dataset import left_out
 from bayesrace.learning.target import KernelScore
 from bayesrace.operation.analysis.results import GpMetrics, LapResult, RaceResult
@@ -20,6 +20,7 @@ from bayesrace.vehicles.parts import GRAVITY_MPS2
 
 if TYPE_CHECKING:
     from bayesrace.learning.identification import Identified
+    from bayesrace.operation.fewest_points import Attempt
 
 __all__ = [
     "COLUMNS",
@@ -30,6 +31,7 @@ __all__ = [
     "print_beyond_limits",
     "print_identified",
     "print_kernels",
+    "print_points",
     "print_table",
     "print_validation",
 ]
@@ -263,6 +265,22 @@ def _kernel_cell(score: KernelScore | None) -> Text:
         return Text("–")
     text = f"{score.rmse:.3g} · {score.log_density:.2f}{' ✓' if score.chosen else '  '}"
     return Text(text, style="bold green" if score.chosen else "")
+
+
+def print_points(attempts: Sequence["Attempt"], chosen: "Attempt", console: Console) -> None:
+    """What fewer and fewer points cost."""
+    errors = (f"RMSE {output}\n{UNITS[output]}" for output in OUTPUTS)
+    table = plain_table("points", "laps\ns", "lost\n%", "±", "off\ntrack", *errors, "data\nkB")
+    for one in attempts:
+        weights, (lost, unsure) = one.training.weights, one.lost(attempts[0])
+        table.add_row(
+            f"{max(weights.counts)}{' ✓' if one is chosen else ''}",
+            f"{one.laps_s.mean(1).sum():.3f}", f"{100 * lost:+.2f}", f"{100 * unsure:.2f}",
+            f"{one.off_track}", *(f"{weights.metrics[name]['rmse']:.3g}" for name in OUTPUTS),
+            f"{len(pack_weights(weights)) / 1000:.0f}",
+        )  # fmt: skip
+    console.print(Text("Flying laps of the learned car, one-step errors held out", style="bold"))
+    console.print(table)
 
 
 def print_beyond_limits(dropped: Mapping[str, int], kept: int, console: Console) -> None:

@@ -19,9 +19,10 @@ from fmpy.simulation import settable_in_instantiated
 
 from bayesrace.errors import InputError
 from bayesrace.plant.fmu.wiring import COMMANDS, STATES
+from bayesrace.units import factor_of
 
 __all__ = [
-    "blank_map", "extract", "factor_of", "inspect", "is_readable", "is_real", "is_settable",
+    "blank_map", "extract", "inspect", "is_readable", "is_real", "is_settable",
     "items_of", "library", "platforms", "range_of", "steps_s",
 ]  # fmt: skip
 
@@ -30,24 +31,6 @@ _MOST_BYTES: Final = 2 << 30
 
 _LARGEST_XML: Final = 16_000_000
 """Bytes of a model description; a hundred thousand variables."""
-
-_UNITS: Final[dict[str, dict[str, float]]] = {
-    "m": {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "km": 1e3, "in": 0.0254, "ft": 0.3048},
-    "m/s": {
-        "m/s": 1.0, "mm/s": 1e-3, "cm/s": 1e-2, "km/h": 1 / 3.6, "kmph": 1 / 3.6, "mph": 0.44704,
-        "ft/s": 0.3048,
-    },
-    "m/s2": {"m/s2": 1.0},
-    "rad": {"rad": 1.0, "1": 1.0, "deg": math.pi / 180, "°": math.pi / 180, "turn": 2 * math.pi},
-    "rad/s": {
-        "rad/s": 1.0, "1/s": 1.0, "deg/s": math.pi / 180, "°/s": math.pi / 180,
-        "rpm": math.pi / 30, "rev/min": math.pi / 30,
-    },
-    "1": {"1": 1.0, "%": 0.01},
-}  # fmt: skip
-"""Of each SI unit, factors from others. Not here: what leaves open whether it counts turns or
-radians, such as 1/min and Hz, and angles for a plain number, because a duty cycle in degrees is a
-mistake."""
 
 _CONTROL: Final = re.compile(r"[\x00-\x1f\x7f\x85\u2028\u2029]+")
 
@@ -235,11 +218,3 @@ def library(path: Path, folder: Path, fmu: Any) -> Path:
         f"{path} is for {platforms(path)}, not for this computer, {platform_tuple}: export it with "
         f"binaries/{fits[-1]}/{name}"
     )
-
-
-def factor_of(unit: str | None, wanted: str) -> float | None:
-    """Factor from a value in ``unit``, also as FMI tools spell it (m.s-1), to one in the SI unit
-    ``wanted``; None if it does not convert."""
-    spelled = re.sub(r"[.*· ]?([a-z]+)\^?-(\d)$", r"/\1\2", unit or "")
-    spelled = re.sub(r"(?<=/[a-z])1$", "", spelled).replace("^2", "2").replace("²", "2")
-    return _UNITS[wanted].get(spelled)

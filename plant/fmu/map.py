@@ -11,16 +11,15 @@ import difflib
 import math
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Final, Literal, Self
+from typing import Annotated, Any, Final, Literal
 
 import numpy as np
 import pydantic
-from pydantic import Discriminator, Field, Tag, model_validator
+from pydantic import Discriminator, Field, Tag
 
 from bayesrace.errors import InputError, faults_in
 from bayesrace.files import parse_toml, read_text
 from bayesrace.plant.fmu.inspection import (
-    factor_of,
     is_readable,
     is_real,
     is_settable,
@@ -28,6 +27,7 @@ from bayesrace.plant.fmu.inspection import (
     range_of,
 )
 from bayesrace.plant.fmu.wiring import COMMANDS, QUANTITIES, STATES, VELOCITIES, Link, Wiring
+from bayesrace.units import Affine, Section, factor_of
 
 __all__ = ["FmuMap", "parse_map", "read_map", "wire"]
 
@@ -39,52 +39,16 @@ def _plain(value: Any) -> Any:
 
 
 Value = Annotated[bool | int | float | str, pydantic.PlainValidator(_plain)]
-Sign = Literal[1, -1]
 
 
-class _Section(pydantic.BaseModel):
-    model_config = pydantic.ConfigDict(
-        frozen=True, extra="forbid", allow_inf_nan=False, populate_by_name=True
-    )
-
-
-class _Affine(_Section):
-    named: ClassVar[str]
-    """The key of the text that will do alone."""
-
-    unit: str | None = Field(None, description="the FMU variable's unit; default: as it declares")
-    sign: Sign = Field(1, description="-1: positive the other way round; a factor is `scale`")
-    scale: float | None = Field(None, description="factor in place of the unit's")
-    offset: float = Field(0.0, description="added after scaling, in the unit of the result")
-
-    @model_validator(mode="before")
-    @classmethod
-    def _short(cls, entry: Any) -> Any:
-        if isinstance(entry, dict | cls):
-            return entry
-        if isinstance(entry, str):
-            return {cls.named: entry}
-        raise ValueError('give the name of a variable of the FMU, or { variable = "name", … }')
-
-    @model_validator(mode="after")
-    def _one_conversion(self) -> Self:
-        if self.scale == 0.0:
-            raise ValueError("scale is 0, which loses the value")
-        if self.scale is not None and self.unit is not None:
-            raise ValueError(
-                "unit and scale both convert: give one of them (the other way round: sign = -1)"
-            )
-        return self
-
-
-class Pick(_Affine):
+class Pick(Affine):
     """One of the FMU's variables, as a quantity of ours."""
 
     named = "variable"
     variable: str
 
 
-class Driven(_Affine):
+class Driven(Affine):
     """The quantity of ours that sets one of the FMU's variables."""
 
     named = "from"
@@ -102,7 +66,7 @@ Setting = Annotated[
 ]
 
 
-class FmuSection(_Section):
+class FmuSection(Section):
     """[fmu]: how the FMU is run."""
 
     step_s: float | None = Field(None, gt=0, description="communication step; must divide a period")
@@ -120,19 +84,19 @@ class FmuSection(_Section):
     )
 
 
-class FmuMap(_Section):
+class FmuMap(Section):
     """A whole map; for what it leaves out, variables with our own names are taken."""
 
     fmu: FmuSection = FmuSection()
-    inputs: dict[str, Setting] = {}
+    inputs: dict[str, Setting] = Field({})
     outputs: dict[
         Literal[
             "x", "y", "psi", "vx", "vy", "omega", "delta", "world_vx", "world_vy", "speed", "slip"
         ],
         Pick,
-    ] = {}
-    parameters: dict[str, Value] = {}
-    start: dict[str, Setting] = {}
+    ] = Field({})
+    parameters: dict[str, Value] = Field({})
+    start: dict[str, Setting] = Field({})
 
 
 def parse_map(text: str, name: str = "map") -> FmuMap:
@@ -330,20 +294,11 @@ class _Matching:
     def _factor(self, entry: Pick | Driven, variable: Any, wanted: str) -> float:
         """The entry's scale, or else that from the variable's unit to ``wanted``; 1 if neither the
         map nor the FMU names a unit, which is SI then."""
-        if entry.scale is not None:
-            return entry.scale
-        unit = variable.unit if entry.unit is None else entry.unit
-        if unit in (None, "", "-"):
-            return 1.0
-        factor, declared = factor_of(unit, wanted), factor_of(variable.unit, wanted)
-        if factor is None:
-            raise InputError(
-                f"the unit '{unit}' of '{variable.name}' does not convert to '{wanted}': correct "
-                "`unit`, or give `scale` instead of it"
-            )
+        factor = entry.factor(variable.name, wanted, variable.unit)
+        declared = None if entry.scale is not None else factor_of(variable.unit, wanted)
         if declared not in (None, factor):
             raise InputError(
-                f"the map says '{variable.name}' is in '{unit}', the FMU declares "
+                f"the map says '{variable.name}' is in '{entry.unit}', the FMU declares "
                 f"'{variable.unit}'; leave the unit out, or give `scale` if the FMU is wrong"
             )
         return factor

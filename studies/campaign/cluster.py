@@ -19,8 +19,7 @@ import dask
 from distributed import Client, Security
 
 from bayesrace.errors import InputError
-from bayesrace.files import read_whole, temporary_folder, write_whole
-from bayesrace.transport.credentials import check_private
+from bayesrace.files import check_private, read_whole, temporary_folder, write_whole
 
 __all__ = ["CampaignError", "Remote", "connected", "run_scheduler", "run_worker"]
 

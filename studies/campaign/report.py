@@ -18,8 +18,9 @@ from matplotlib.figure import Figure
 from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
 from bayesrace.files import write_whole
+from bayesrace.operation.look import look
 from bayesrace.operation.report.render import template
-from bayesrace.operation.report.style import INK, PANEL_WIDTH, figure_style, inline_svg, look, panel
+from bayesrace.operation.report.style import INK, PANEL_WIDTH, figure_style, inline_svg, panel
 from bayesrace.studies.campaign.case import CONTROLLERS, FAILED, factors
 from bayesrace.studies.campaign.results import read_results
 

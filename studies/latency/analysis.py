@@ -9,10 +9,11 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from bayesrace.arrays import Floats
 from bayesrace.columns import Columns
+from bayesrace.operation.analysis.results import ResultModel
 from bayesrace.studies.latency.legs import (
     ANSWER,
     LEGS,
@@ -44,12 +45,7 @@ _INTERVALS: Final = 60
 """Of the medians, at most; each takes two seconds at least."""
 
 
-class _Frozen(BaseModel):
-    # Numbers that are not finite have no place in JSON: what is not known is null.
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
-
-class Distribution(_Frozen):
+class Distribution(ResultModel):
     """Percentiles [us], each the smallest value that this share of all do not exceed."""
 
     p50: float
@@ -101,7 +97,7 @@ class BareLoop(Distribution):
     refused: list[str] = Field(description="scheduling options that the system refused")
 
 
-class Traffic(_Frozen):
+class Traffic(ResultModel):
     """Messages of one direction, by the sender's numbers and the receiver's counters."""
 
     sent: int
@@ -111,7 +107,7 @@ class Traffic(_Frozen):
     complete: bool = Field(description="in_flight is at most what can be on its way")
 
 
-class Clocks(_Frozen):
+class Clocks(ResultModel):
     """How times of plant and controller were brought together."""
 
     shared: bool = Field(description="one clock: legs that cross from one to the other are exact")
@@ -121,7 +117,7 @@ class Clocks(_Frozen):
     exchanges: int = Field(description="states and answers that bound the offset")
 
 
-class Memory(_Frozen):
+class Memory(ResultModel):
     """Resident memory of one process."""
 
     begin_bytes: int = Field(description="after the first minute, or third of a shorter run")
@@ -133,7 +129,7 @@ class Memory(_Frozen):
         return self.most_bytes - self.begin_bytes
 
 
-class LatencyResult(_Frozen):
+class LatencyResult(ResultModel):
     """One measurement; null: not known from the log or the measurement."""
 
     car: str

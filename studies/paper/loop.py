@@ -14,9 +14,10 @@ from matplotlib.figure import Figure
 
 from bayesrace.arrays import Floats
 from bayesrace.operation.analysis.race import DrivenRun
+from bayesrace.operation.look import look
 from bayesrace.operation.report.maps import draw_edges, show_all
 from bayesrace.operation.report.panels import input_figures
-from bayesrace.operation.report.style import MUTED, WARNING, look, panel
+from bayesrace.operation.report.style import MUTED, WARNING, panel
 from bayesrace.plant.simulator import PLANT
 from bayesrace.raceline import RaceLine, RaceLineSettings
 from bayesrace.raceline.friction import timed_line

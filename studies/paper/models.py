@@ -23,9 +23,10 @@ from bayesrace.learning.gaussian_process import PairDistances, Posterior, maximi
 from bayesrace.learning.settings import TrainingSettings
 from bayesrace.learning.target import Target
 from bayesrace.learning.validation import Validation, residual, validate
+from bayesrace.operation.look import look
 from bayesrace.operation.preparation import trained_weights
 from bayesrace.operation.report.gp import gp_figures
-from bayesrace.operation.report.style import INK, WARNING, look, panel
+from bayesrace.operation.report.style import INK, WARNING, panel
 from bayesrace.operation.terminal import SMOOTHNESS, SYMBOLS, UNCERTAIN
 from bayesrace.operation.terminal.terminal import Stage, Stages
 from bayesrace.studies.paper.experiment import GP, Figures, Finding, Section, at_most, stored

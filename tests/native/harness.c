@@ -19,7 +19,7 @@
 #include "check.h"
 
 static int armed = 0;
-static const double none[BR_NU]; /* input before */
+static const double no_input[BR_NU]; /* input before */
 
 #ifdef COUNT_ALLOCATIONS
 void *__real_malloc(size_t size);
@@ -107,12 +107,12 @@ static void check_memory_errors(char *block, size_t size) {
 static void check_not_ready(br_mpc *mpc, const br_mpc_parameters *p) {
     double x[BR_NX] = {0}, u[BR_NU] = {7, 7};
     br_mpc_status status;
-    CHECK(br_mpc_step(mpc, x, none, NULL, BR_TS, 0, u, &status, NULL) == BR_ERROR_NOT_READY);
+    CHECK(br_mpc_step(mpc, x, no_input, NULL, BR_TS, 0, u, &status, NULL) == BR_ERROR_NOT_READY);
     CHECK(br_mpc_prepare(mpc, BR_TS, 0) == BR_ERROR_NOT_READY);
     CHECK(br_mpc_predict(mpc, x, u, 0, x) == BR_ERROR_NOT_READY);
     CHECK(br_mpc_set_parameters(mpc, p) == BR_OK);
     CHECK(br_mpc_prepare(mpc, BR_TS, 0) == BR_OK); /* no plan yet: nothing to do */
-    CHECK(br_mpc_step(mpc, x, none, NULL, BR_TS, 0, u, &status, NULL) ==
+    CHECK(br_mpc_step(mpc, x, no_input, NULL, BR_TS, 0, u, &status, NULL) ==
           BR_ERROR_NOT_READY); /* no path */
     CHECK(u[0] == 7 && u[1] == 7);
 }
@@ -154,11 +154,11 @@ static void check_null(br_mpc *mpc, const double *table, int rows, double spacin
     CHECK(br_mpc_set_path(mpc, table, BR_PATH_CAPACITY + 1, spacing) == BR_ERROR_PATH);
     CHECK(br_mpc_set_weights(NULL, NULL) == BR_ERROR_NULL);
     CHECK(br_mpc_set_weights(mpc, NULL) == BR_ERROR_NULL);
-    CHECK(br_mpc_step(NULL, x, none, NULL, BR_TS, 0, u, &status, NULL) == BR_ERROR_NULL);
-    CHECK(br_mpc_step(mpc, NULL, none, NULL, BR_TS, 0, u, &status, NULL) == BR_ERROR_NULL);
-    CHECK(br_mpc_step(mpc, x, none, NULL, BR_TS, 0, NULL, &status, NULL) == BR_ERROR_NULL);
-    CHECK(br_mpc_step(mpc, x, none, NULL, BR_TS, 0, u, NULL, NULL) == BR_ERROR_NULL);
-    CHECK(br_mpc_solve(mpc, x, none, BR_TS, 0, NULL, u, &status, NULL) == BR_ERROR_NULL);
+    CHECK(br_mpc_step(NULL, x, no_input, NULL, BR_TS, 0, u, &status, NULL) == BR_ERROR_NULL);
+    CHECK(br_mpc_step(mpc, NULL, no_input, NULL, BR_TS, 0, u, &status, NULL) == BR_ERROR_NULL);
+    CHECK(br_mpc_step(mpc, x, no_input, NULL, BR_TS, 0, NULL, &status, NULL) == BR_ERROR_NULL);
+    CHECK(br_mpc_step(mpc, x, no_input, NULL, BR_TS, 0, u, NULL, NULL) == BR_ERROR_NULL);
+    CHECK(br_mpc_solve(mpc, x, no_input, BR_TS, 0, NULL, u, &status, NULL) == BR_ERROR_NULL);
     CHECK(br_mpc_prepare(NULL, BR_TS, 0) == BR_ERROR_NULL);
     CHECK(br_mpc_set_clock(NULL, NULL, NULL) == BR_ERROR_NULL);
     CHECK(br_mpc_predict(NULL, x, u, 0, x) == BR_ERROR_NULL);
@@ -180,7 +180,7 @@ static void check_times(br_mpc *mpc) {
     double x[BR_NX] = {0}, u[BR_NU] = {0};
     br_mpc_status status;
     for (size_t i = 0; i < sizeof bad / sizeof bad[0]; ++i) {
-        CHECK(br_mpc_step(mpc, x, none, NULL, bad[i], 0, u, &status, NULL) == BR_ERROR_TIME);
+        CHECK(br_mpc_step(mpc, x, no_input, NULL, bad[i], 0, u, &status, NULL) == BR_ERROR_TIME);
         CHECK(br_mpc_prepare(mpc, bad[i], 0) == BR_ERROR_TIME);
         CHECK(br_mpc_predict(mpc, x, u, bad[i], x) == BR_ERROR_TIME);
         CHECK(br_mpc_observe(mpc, x, u, bad[i], x, NULL) == BR_ERROR_TIME);

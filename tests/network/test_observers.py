@@ -20,13 +20,13 @@ import pytest
 from bayesrace.configuration import read_configuration
 from bayesrace.transport import free_endpoint
 from bayesrace.transport.relay import Relay
-from tests.network.cars import Course, gentle_course, start_controller, start_plant
+from tests.network.cars import Course, start_controller, start_plant
 from tests.network.observer import observing
 from tests.programs import ROOT, environment, until
 from tests.security.authority import Bundles, bundles
-from tests.security.rig import secured
+from tests.security.rig import course, secured
 
-__all__ = ["bundles"]
+__all__ = ["bundles", "course"]
 
 pytestmark = [pytest.mark.wall_clock, pytest.mark.unmeasured]
 
@@ -35,11 +35,6 @@ LOOK_S = 2.0
 MOST_UNDRIVEN = 50
 """Of the 100 periods between two looks: a machine with other work stalls now and then, and was seen
 to miss 31 of 500 so. A plant that waits gets no command for 9 s."""
-
-
-@pytest.fixture(scope="module")
-def course(tmp_path_factory: pytest.TempPathFactory) -> Course:
-    return gentle_course(tmp_path_factory.mktemp("course"))
 
 
 @contextmanager
@@ -80,8 +75,13 @@ def stopped(process: subprocess.Popen[str]) -> Callable[[], None]:
 
 
 @pytest.mark.parametrize(
-    "count",
-    [5, pytest.param(1, marks=pytest.mark.check), pytest.param(50, marks=pytest.mark.check)],
+    ("course", "count"),
+    [
+        ("Python", 5),
+        *(pytest.param(*one, marks=pytest.mark.check) for one in (("Python", 1), ("Python", 50))),
+        pytest.param("C", 5, marks=pytest.mark.check),
+    ],
+    indirect=["course"],
 )
 def test_observers_that_are_stopped(tmp_path: Path, course: Course, count: int) -> None:
     with driving(tmp_path, course) as (where, braked), bystanders(count, where) as process:

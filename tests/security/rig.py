@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Final
 
 import pytest
 
@@ -19,12 +20,20 @@ from tests.network.observer import Journey
 from tests.programs import PATIENCE_S, ROOT
 from tests.security.authority import CAR, Bundles, written
 
-__all__ = ["Rig", "attacking", "course", "secured"]
+__all__ = ["BOTH", "Rig", "attacking", "course", "secured"]
+
+
+BOTH: Final = pytest.mark.parametrize(
+    "course", ["Python", pytest.param("C", marks=pytest.mark.check)], indirect=True
+)
+"""By the controller in Python, and by that without and its bridge."""
 
 
 @pytest.fixture(scope="module")
-def course(tmp_path_factory: pytest.TempPathFactory) -> Course:
-    return gentle_course(tmp_path_factory.mktemp("course"))
+def course(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest) -> Course:
+    """For the controller in Python, or by parameter for that without."""
+    language = getattr(request, "param", "Python")
+    return gentle_course(tmp_path_factory.mktemp("course"), language=language)
 
 
 @dataclass
@@ -82,8 +91,7 @@ def secured(
         if router:
             between = stack.enter_context(Program(folder / "router.txt", "router", *options))
         plant = stack.enter_context(Program(folder / "plant.txt", "plant", *options))
-        driver = ("controller", *course.arguments, *options)
-        controller = stack.enter_context(Program(folder / "controller.txt", *driver))
+        controller = stack.enter_context(course.controller(folder / "controller.txt", *options))
         endpoints = read_configuration(config).endpoints("director")
         closing = stack.enter_context(ExitStack())
         session = closing.enter_context(open_session(endpoints, "director"))

@@ -25,7 +25,7 @@ from tests.network.cars import Course, Program
 from tests.network.observer import STANDING_MPS, Journey
 from tests.programs import run, until
 from tests.security.authority import CAR, Bundles, bundles, written
-from tests.security.rig import attacking, course, secured
+from tests.security.rig import BOTH, attacking, course, secured
 
 __all__ = ["bundles", "course"]
 
@@ -100,8 +100,8 @@ def held(folder: Path, course: Course, bundles: Bundles, *options: str) -> Itera
     with ExitStack() as stack:
         with_config = ("--config", config)
         plant = stack.enter_context(Program(folder / "plant.txt", "plant", *with_config))
-        driver = ("controller", *course.arguments, *with_config)
-        controller = stack.enter_context(Program(folder / "controller.txt", *driver))
+        driver = course.controller(folder / "controller.txt", *with_config)
+        controller = stack.enter_context(driver)
         to_plant, to_controller = (
             stack.enter_context(Relay(one)) for one in (plant_at, controller_at)
         )
@@ -131,6 +131,7 @@ def held(folder: Path, course: Course, bundles: Bundles, *options: str) -> Itera
         yield rig
 
 
+@BOTH
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP])
 def test_a_car_whose_director_is_killed_or_hangs_stands(
     tmp_path: Path, course: Course, bundles: Bundles, how: signal.Signals
@@ -188,6 +189,7 @@ def test_the_plant_stops_the_car_when_the_controller_is_gone_as_well(
         rig.check_stands(since_ns)
 
 
+@BOTH
 def test_the_controller_stops_the_car_alone(
     tmp_path: Path, course: Course, bundles: Bundles
 ) -> None:

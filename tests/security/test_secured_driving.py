@@ -33,7 +33,7 @@ from tests.network.observer import STANDING_MPS
 from tests.programs import PATIENCE_S, run, until
 from tests.security.authority import CAR, Bundles, bundles, written
 from tests.security.intruder import bare_session
-from tests.security.rig import Rig, attacking, course, secured
+from tests.security.rig import BOTH, Rig, attacking, course, secured
 
 __all__ = ["bundles", "course"]
 
@@ -167,7 +167,9 @@ def asking(rig: Rig, endpoint: str, source: str, rate: int) -> Iterator[None]:
 
 
 @pytest.mark.check
-@pytest.mark.parametrize("rate", [30, 1280])
+@pytest.mark.parametrize(
+    ("course", "rate"), [("Python", 30), ("Python", 1280), ("C", 1280)], indirect=["course"]
+)
 def test_each_stop_gets_through_while_viewers_ask_for_the_status_without_end(
     tmp_path: Path, course: Course, bundles: Bundles, rate: int
 ) -> None:
@@ -202,7 +204,15 @@ def test_each_stop_gets_through_while_viewers_ask_for_the_status_without_end(
 # Replayed ----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("source", ["plant", "controller"])
+@pytest.mark.parametrize(
+    ("course", "source"),
+    [
+        ("Python", "plant"),
+        ("Python", "controller"),
+        pytest.param("C", "plant", marks=pytest.mark.check),
+    ],
+    indirect=["course"],
+)
 def test_what_was_recorded_has_no_effect_when_it_is_sent_again(
     tmp_path: Path, course: Course, bundles: Bundles, source: str
 ) -> None:
@@ -250,18 +260,21 @@ def certified(folder: Path, brief: str = "") -> Bundles:
     return Bundles(folder)
 
 
-def check_ended(program: Program, name: str, code: int = 75) -> None:
+def check_ended(program: Program, name: str, code: int = 75, *others: Program) -> None:
     """It has ended because of its certificate, and says so in one line, with the remedy.
 
     ``code``: 75, a failure that passes, where it would wait for another one at its next start.
+    ``others``: what these say helps to understand a failure.
     """
     assert program.process.wait(PATIENCE_S) == code, program.said()
     last = program.said().strip().splitlines()[-1]
-    assert f"bayesrace: certificate '{name}' has expired" in last
+    said = [one.said() for one in others]
+    assert f"bayesrace: certificate '{name}' has expired" in last, (program.said(), *said)
     assert f"bayesrace certs add {name} --renew" in last
     assert "Traceback" not in program.said()
 
 
+@BOTH
 def test_a_controller_whose_certificate_ends_does_so_and_its_car_brakes(
     tmp_path: Path, course: Course
 ) -> None:
@@ -319,7 +332,7 @@ def test_commands_whose_certificate_ends_do_so(tmp_path: Path, course: Course) -
         }
         until(lambda: rig.phase() == "driving", "driving")
         for role, program in started.items():
-            check_ended(program, names[role], 75 if role == "router" else 2)
+            check_ended(program, names[role], 75 if role == "router" else 2, rig.controller)
 
 
 def test_a_process_whose_certificate_ends_is_interrupted_once(bundles: Bundles) -> None:

@@ -21,7 +21,7 @@ import pytest
 
 from bayesrace.controller.assembly import PredictiveController, predictive_controller
 from bayesrace.controller.settings import GateSettings
-from bayesrace.controller.weights.adoption import Ruling
+from bayesrace.controller.weights.adoption import Adoption, Ruling
 from bayesrace.controller.weights.manager import WeightUpdateManager
 from bayesrace.gp.weights import Weights, encode_weights
 from bayesrace.messages import ROLLBACK, WEIGHTS, Reply, RollbackRequest
@@ -49,9 +49,10 @@ class Bench:
         self.events: list[tuple[str, str]] = []
         """Kind and text."""
         self.manager = WeightUpdateManager(
-            session, CAR, controller.port, gate,
+            session, CAR, controller.port, Adoption(controller.port, gate), gate,
             lambda kind, text, _: self.events.append((kind, text)),
         )  # fmt: skip
+        assert isinstance(self.manager.adoption, Adoption)
         self.adoption = self.manager.adoption
         self._seq = 0
 
@@ -138,7 +139,7 @@ def bench(
 def test_an_offer_that_the_control_loop_does_not_adopt_is_withdrawn(
     course: Course, good: Weights, again: Weights, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("bayesrace.controller.weights.manager._TASK_S", 0.1)
+    monkeypatch.setattr("bayesrace.controller.weights.adoption._TASK_S", 0.1)
     with bench(course) as made:
         refusal = made.send(again).result(60.0)
         assert not refusal.accepted

@@ -7,6 +7,8 @@ the car goes back only to what is no worse; going back restores the weights to t
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -57,6 +59,16 @@ def adopt(step: NativeStep, new: Weights) -> None:
     step.adopt_weights()
 
 
+def compared(step: NativeStep, car: Car) -> Any:
+    """What a watch compares."""
+    watch = Watch(GateSettings(), car, step)
+    watch.look()
+    found = watch.trial.found
+    names = ("in_use", "proven", "nominal")
+    whole = {"samples": found.samples, "fresh": found.fresh}
+    return SimpleNamespace(**whole, **{name: list(getattr(found, name)) for name in names})
+
+
 def show(
     step: NativeStep, drive: Drive, first: int = 0, last: int = 600, noise: Floats | None = None
 ) -> Iterator[int]:
@@ -77,11 +89,11 @@ def watched(
     step.set_weights(old)
     list(show(step, drive, last=before))
     adopt(step, new)
-    watch = Watch(GateSettings(), car, STEP_S)
+    watch = Watch(GateSettings(), car, step)
     found: list[tuple[int, Ruling]] = []
     for k in show(step, drive, first=before):
         watch.observe(float(drive[0][k, 3]), False)
-        if (ruling := watch.look(step.watch(watch.resolution))) is not None:
+        if (ruling := watch.look()) is not None:
             found.append((k + 1 - before, ruling))
             if ruling.action != "slow":
                 break
@@ -100,7 +112,7 @@ def test_the_errors_are_those_of_the_weights(
     assert not noise.any()
     np.testing.assert_allclose(features, reference.sample_features[:90], rtol=0, atol=1e-12)
     np.testing.assert_allclose(residuals, reference.sample_residuals[:90], rtol=0, atol=1e-9)
-    found = step.watch(RESOLUTION)
+    found = compared(step, car)
     assert (found.samples, found.fresh) == (90, 90)
     rms = np.sqrt((residuals**2).mean(axis=0))
     assert list(found.nominal) == pytest.approx(rms.tolist(), rel=1e-9)
@@ -118,13 +130,13 @@ def test_what_noise_explains_is_no_error(
     list(show(step, drive, last=90, noise=noise))
     _, residuals, stated = step.samples()
     np.testing.assert_allclose(stated, noise[:, 3:6], rtol=1e-9)
-    found = step.watch(RESOLUTION)
+    found = compared(step, car)
     weight = 1 / (1 + stated / RESOLUTION**2)
     beyond = (weight * (residuals**2 - stated)).sum(axis=0) / weight.sum(axis=0)
     assert list(found.nominal) == pytest.approx(np.sqrt(beyond).tolist(), rel=1e-9)
     noise[:] = 1.0  # more than all errors
     list(show(step, drive, 90, 90 + WATCHED, np.tile(noise, (3, 1))))
-    found = step.watch(RESOLUTION)
+    found = compared(step, car)
     assert [*found.in_use, *found.proven, *found.nominal] == [0.0] * 9
 
 
@@ -151,17 +163,19 @@ def test_states_are_estimated_by_the_proven_weights_while_others_are_watched(
     assert believed() == found[1]
 
 
-def test_the_newest_samples_are_kept(step: NativeStep, drive: Drive, honest: Weights) -> None:
+def test_the_newest_samples_are_kept(
+    step: NativeStep, drive: Drive, honest: Weights, car: Car
+) -> None:
     list(show(step, drive))
     features, _, _ = step.samples()
     assert len(features) == SAMPLES
     np.testing.assert_array_equal(features[:, :4], drive[0][600 - SAMPLES : 600, 3:])
     adopt(step, honest)
-    found = step.watch(RESOLUTION)
+    found = compared(step, car)
     assert (found.samples, found.fresh) == (0, 0)
     for _ in range(WATCHED):
         step.prepare()
-    assert step.watch(RESOLUTION).samples == WATCHED
+    assert compared(step, car).samples == WATCHED
 
 
 def test_the_watch_keeps_honest_weights(
@@ -203,10 +217,10 @@ def test_the_watch_rolls_back_what_leaves_no_solution(
     """A car that stands has no error by which weights could be judged."""
     adopt(step, honest)
     for falls, actions in (([None] * 1000, 0), ([True] * 25, 1), ([True, False] * 500, 0)):
-        watch, found = Watch(GateSettings(), car, STEP_S), 0
+        watch, found = Watch(GateSettings(), car, step), 0
         for fallen_back in falls:
             watch.observe(0.0, fallen_back)
-            found += watch.look(step.watch(watch.resolution)) is not None
+            found += watch.look() is not None
         assert found == actions
 
 

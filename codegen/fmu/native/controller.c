@@ -49,8 +49,10 @@ bool fmu_model_create(fmu_instance *instance) {
 /* Gives the parameters to the step and to the cycle. */
 static br_mpc_error use_parameters(controller *c, const double *v) {
 #define TAKE(name) .name = v[FMU_V_##name],
-    const br_mpc_parameters parameters = {BR_PARAMETERS(TAKE) BR_SOLVER_FIELDS(TAKE, TAKE)};
+#define TAKE_WHOLE(name) .name = (int)v[FMU_V_##name],
+    const br_mpc_parameters parameters = {BR_PARAMETERS(TAKE) BR_SOLVER_FIELDS(TAKE, TAKE_WHOLE)};
 #undef TAKE
+#undef TAKE_WHOLE
     const br_driving driving = {
         .u_low = {parameters.d_min, -parameters.delta_rate_max_radps},
         .u_high = {parameters.d_max, parameters.delta_rate_max_radps},

@@ -94,7 +94,7 @@ bool fmu_set_times(fmu_instance *instance, double start, bool has_stop, double s
     if (!isfinite(start) || (has_stop && !(stop >= start)))
         return fmu_refuse(instance, "start time %g and stop time %g are no interval", start, stop);
     instance->value[FMU_V_time] = start;
-    instance->stop_time = has_stop ? stop : INFINITY;
+    instance->stop_time = has_stop ? stop : (double)INFINITY;
     return true;
 }
 

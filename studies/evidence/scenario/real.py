@@ -19,6 +19,7 @@ from bayesrace.operation.race import plant_options
 from bayesrace.operation.system import CONFIGURATION, child, private_network, started_system
 from bayesrace.plant.faults import write_sensor_faults
 from bayesrace.recorder import Recorder
+from bayesrace.scene import Scene
 from bayesrace.studies.evidence.scenario.events import LinkEvent, PartitionEvent, timeline
 from bayesrace.studies.evidence.scenario.preparing import Ready
 from bayesrace.studies.evidence.scenario.simulated import SETTLING_S
@@ -99,7 +100,8 @@ def drive_real(ready: Ready, folder: Path) -> None:
         events: Publisher[Event] = Publisher(session, EVENT, car.name, "race")
         director = Director(session, car.name)
         director.wait_for(("plant", "controller"), 60.0)
-        with Recorder(session, car.name, folder / "run.mcap", about) as recorder:
+        scene = Scene(car, first.track, first.line)
+        with Recorder(session, car.name, folder / "run.mcap", about, scene=scene) as recorder:
             over = threading.Event()
             with ThreadPoolExecutor(1) as beside:
                 happening = beside.submit(_let_happen, ready, processes, over)

@@ -11,11 +11,12 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 from rich.console import Console
 
 from bayesrace.errors import InputError
 from bayesrace.files import parse_toml, read_text, temporary_folder, write_whole
+from bayesrace.operation.analysis.results import ResultModel
 from bayesrace.operation.report.style import figure_style, inline_svg
 from bayesrace.operation.terminal.terminal import Stages, stages_on
 from bayesrace.studies.evidence.scenario.checks import Drive, judged
@@ -27,10 +28,8 @@ from bayesrace.studies.evidence.verdict import Check, Verdict
 __all__ = ["Result", "read_grid", "run_scenarios", "verdict_of"]
 
 
-class Result(BaseModel):
+class Result(ResultModel):
     """One scenario, driven and judged; null: not known."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     name: str
     scenario: Scenario

@@ -8,6 +8,7 @@ from bayesrace.controller.assembly import predictive_controller
 from bayesrace.log import LogWriter
 from bayesrace.operation.simulation import SimulatedSystem
 from bayesrace.plant.vehicle import open_vehicle
+from bayesrace.scene import Scene
 from bayesrace.studies.evidence.scenario.events import timeline
 from bayesrace.studies.evidence.scenario.preparing import Ready
 
@@ -26,7 +27,8 @@ def drive_simulated(ready: Ready, folder: Path) -> None:
         first.track_file, first.line_file, folder / "mpc.json", ready.first_weights,
     )  # fmt: skip
     played = plant.car, plant.fmu, plant.fmu_map, plant.rate_hz, compiled
-    log = LogWriter(folder / "run.mcap")
+    scene = Scene(plant.car, first.track, first.line, plant.name)
+    log = LogWriter(folder / "run.mcap", scene=scene)
     try:
         with (
             open_vehicle(*played, simulator=plant.simulator, world=plant.changes) as vehicle,

@@ -4,15 +4,16 @@ long both took."""
 from typing import Final
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 from scipy.interpolate import CubicHermiteSpline
 
 from bayesrace.arrays import Flags, Floats
+from bayesrace.operation.analysis.results import Percentiles, ResultModel
 from bayesrace.studies.evidence.inputs import INPUTS
 from bayesrace.studies.evidence.shadow.cycles import Beside, Side
 from bayesrace.tracks import Track
 
-__all__ = ["Compared", "Place", "Promise", "Spread", "apart", "compare", "plan_errors"]
+__all__ = ["Compared", "Place", "Promise", "apart", "compare", "plan_errors"]
 
 _ALIKE: Final = 0.02, 0.2
 """Inputs that differ by no more (d, delta_rate [rad/s]) bring about nearly the same."""
@@ -22,19 +23,7 @@ _NEAR_S: Final = 0.5
 """Between two of the largest differences."""
 
 
-class _Frozen(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
-
-class Spread(_Frozen):
-    """Of numbers that are not negative."""
-
-    p50: float
-    p99: float
-    max: float
-
-
-class Place(_Frozen):
+class Place(ResultModel):
     """One of the largest differences."""
 
     time_s: float
@@ -46,15 +35,15 @@ class Place(_Frozen):
     level: int = Field(description="of the shadow's fallback; 0: a solution")
 
 
-class Promised(_Frozen):
+class Promised(ResultModel):
     """By the plans of one of the two."""
 
-    off_m: Spread = Field(description="distance of planned and actual position")
-    alike_m: Spread | None = Field(description="of these: where both decided nearly the same")
+    off_m: Percentiles = Field(description="distance of planned and actual position")
+    alike_m: Percentiles | None = Field(description="of these: where both decided nearly the same")
     way_m: float = Field(description="mean length of the way as planned")
 
 
-class Promise(_Frozen):
+class Promise(ResultModel):
     """Plans against what came, after a time."""
 
     after_s: float
@@ -65,7 +54,7 @@ class Promise(_Frozen):
     came_m: float = Field(description="mean length of the way")
 
 
-class Compared(_Frozen):
+class Compared(ResultModel):
     """One shadow in one run."""
 
     run: int
@@ -75,12 +64,12 @@ class Compared(_Frozen):
     shadow_weights: tuple[str, ...]
     inputs: int = Field(description="of the controller while it drove")
     answered: int
-    apart: dict[str, Spread] = Field(description="inputs: d [command], delta_rate [rad/s]")
+    apart: dict[str, Percentiles] = Field(description="inputs: d [command], delta_rate [rad/s]")
     places: tuple[Place, ...]
     driving_solutions: float = Field(description="share of the cycles")
     shadow_solutions: float
-    driving_step_us: Spread
-    shadow_step_us: Spread
+    driving_step_us: Percentiles
+    shadow_step_us: Percentiles
     shadow_missed: int = Field(description="cycles that took longer than their period")
     promises: tuple[Promise, ...]
 
@@ -99,19 +88,15 @@ def compare(one: Beside, track: Track | None = None) -> Compared:
         run=one.run, shadow=one.name, lockstep=one.lockstep, inputs=one.inputs,
         driving_weights=one.driving.versions, shadow_weights=one.shadow.versions,
         answered=len(one.time_s),
-        apart=dict(zip(INPUTS, map(_spread, differences.T), strict=True)),
+        apart=dict(zip(INPUTS, map(Percentiles.of, differences.T), strict=True)),
         places=tuple(_places(one, differences, track)),
         driving_solutions=float(np.mean(one.driving.level == 0)),
         shadow_solutions=float(np.mean(one.shadow.level == 0)),
-        driving_step_us=_spread(one.driving.solve_us), shadow_step_us=_spread(one.shadow.solve_us),
+        driving_step_us=Percentiles.of(one.driving.solve_us),
+        shadow_step_us=Percentiles.of(one.shadow.solve_us),
         shadow_missed=one.shadow.missed,
         promises=tuple(found for found in promises if found is not None),
     )  # fmt: skip
-
-
-def _spread(values: Floats) -> Spread:
-    p50, p99, most = np.percentile(values, (50, 99, 100))
-    return Spread(p50=float(p50), p99=float(p99), max=float(most))
 
 
 def _places(one: Beside, differences: Floats, track: Track | None) -> list[Place]:
@@ -164,8 +149,8 @@ def _promise(one: Beside, after_s: float, alike: Flags) -> Promise | None:
     same = both & alike
     controller, shadow = (
         Promised(
-            off_m=_spread(found[both, 0]),
-            alike_m=_spread(found[same, 0]) if same.any() else None,
+            off_m=Percentiles.of(found[both, 0]),
+            alike_m=Percentiles.of(found[same, 0]) if same.any() else None,
             way_m=float(found[both, 1].mean()),
         )
         for found in sides
