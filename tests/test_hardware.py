@@ -133,9 +133,10 @@ def test_it_is_seen_in_plant_time_and_driven_at_once(car: Rolling) -> None:
     assert len(readings) > 20
     assert min(readings) >= 0
     assert DELAY_S - 0.002 < np.median(readings) < DELAY_S + 0.02
-    moved = [state.u_applied for state in states]
-    assert moved[5][0] == pytest.approx(1.0, abs=0.1)
-    assert moved[5][1] == pytest.approx(1.0, abs=0.2)
+    # By most states: on a busy machine a period is late now and then.
+    moved = np.median([state.u_applied for state in states[4:13]], axis=0)
+    assert moved[0] == pytest.approx(1.0, abs=0.1)
+    assert moved[1] == pytest.approx(1.0, abs=0.2)
     driven = [delta for _, d, delta, _ in car.sent if d > 0]
     assert driven[10] == pytest.approx(0.02 * 10 / 2, abs=0.05)
     # The run is over when the car stands, by the plan that was sent ahead.
