@@ -16,6 +16,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -24,7 +25,7 @@ import zenoh
 from numpy.typing import NDArray
 
 from bayesrace.clock import sleep_until_ns
-from bayesrace.operation.system import child
+from bayesrace.operation.system import Child, child
 from bayesrace.processes import die_with_parent
 from bayesrace.realtime import RealtimeSettings, prepare_thread
 from bayesrace.studies.latency.analysis import BareLoop, Series
@@ -35,37 +36,63 @@ __all__ = ["bare_loop", "bare_result", "read_bare_loop", "read_round_trips", "ru
 _LOOP: Final = "bare_loop"
 _MESSAGES: Final = "round_trip"
 """Names of the files: ``.npy`` with the numbers, ``.log`` with the output."""
+_BEGIN: Final = "begin.npy"
+"""When the periods begin [ns], 0 until that is known; whether loop and messages are ready."""
 
 _BYTES: Final = bytes(120)
 _LOOK_S: Final = 0.01
+_READY_S: Final = 30.0
+"""A busy machine takes long to start them; what is not ready by then begins late."""
 
 
 @contextmanager
 def running_beside(
-    out: Path, load: int, realtime: RealtimeSettings, rate_hz: float, begin_ns: int, count: int
-) -> Iterator[None]:
-    """A bare loop and bare messages, both ``count`` periods from ``begin_ns`` on, and ``load`` busy
-    processes for the block; at its end the numbers are in the folder ``out``."""
+    out: Path, load: int, realtime: RealtimeSettings, rate_hz: float, count: int
+) -> Iterator[Callable[[int], None]]:
+    """A bare loop and bare messages, ``count`` periods of both, and ``load`` busy processes for the
+    block; at its end the numbers are in the folder ``out``.
+
+    The block begins when they are ready, and calls what it is given with the time at which the
+    periods begin [ns].
+    """
     np.save(out / f"{_MESSAGES}.npy", np.zeros(count, dtype=np.int64))
+    begin_path = str(out / _BEGIN)
+    np.save(begin_path, np.zeros(3, dtype=np.int64))
+    begin = np.lib.format.open_memmap(begin_path, mode="r+")
     with ExitStack() as stack:
+        stack.callback(os.unlink, begin_path)
         (endpoint,) = stack.enter_context(private_endpoints("answers"))
 
-        def start(log: str, **task: Any) -> Any:
-            task |= {"realtime": realtime.model_dump(), "period_ns": round(1e9 / rate_hz)}
+        def start(name: str, work: str, **task: Any) -> Child:
+            task |= {"realtime": realtime.model_dump(), "work": work}
             line = ["--parent-pid", str(os.getpid()), json.dumps(task)]
-            return stack.enter_context(
-                child(line, out / f"{log}.log", "bayesrace.studies.latency.beside")
-            )
+            module = "bayesrace.studies.latency.beside"
+            return stack.enter_context(child(line, out / f"{name}.log", module))
 
-        for _ in range(load):
-            start("load", work="load")
+        period = {"begin_path": begin_path, "period_ns": round(1e9 / rate_hz)}
         path = str(out / f"{_LOOP}.npy")
-        bare = start(_LOOP, work="loop", path=path, count=count, begin_ns=begin_ns)
-        start("answer", work="answer", endpoint=endpoint)
+        bare = start(_LOOP, "loop", path=path, count=count, **period)
+        answer = start("answer", "answer", endpoint=endpoint)
         path = str(out / f"{_MESSAGES}.npy")
-        start(_MESSAGES, work="send", endpoint=endpoint, path=path, begin_ns=begin_ns)
-        yield
+        messages = start(_MESSAGES, "send", endpoint=endpoint, path=path, **period)
+        for _ in range(load):
+            start("load", "load")
+        deadline = time.monotonic() + _READY_S
+        while not begin[1:].all() and time.monotonic() < deadline:
+            if any(one.ended() for one in (bare, answer, messages)):
+                break
+            time.sleep(_LOOK_S)
+        yield partial(begin.__setitem__, 0)
         bare.wait(1.0)
+
+
+def _begin_ns(path: str, place: int) -> int:
+    """When the periods begin, waited for by a process that is ready."""
+    begin = np.lib.format.open_memmap(path, mode="r+")
+    begin[place] = 1
+    while not begin[0]:
+        time.sleep(_LOOK_S)
+    return int(begin[0])
 
 
 def _read(path: Path) -> NDArray[np.int64]:
@@ -135,31 +162,31 @@ def bare_loop(
     return late_ns[:woken]
 
 
-def _loop(path: str, period_ns: int, begin_ns: int, count: int) -> None:
+def _loop(path: str, begin_path: str, period_ns: int, count: int) -> None:
     """The bare loop as a process; SIGTERM ends it early, and it keeps what it has measured."""
-    signals: list[int] = []
+    begin_ns, signals = _begin_ns(begin_path, 1), list[int]()
     signal.signal(signal.SIGTERM, lambda number, _frame: signals.append(number))
     np.save(path, bare_loop(count, period_ns, begin_ns, lambda: bool(signals)))
 
 
-def _answer(endpoint: str, period_ns: int) -> None:
-    """Sends back what comes, until it is ended."""
+def _answer(endpoint: str) -> None:
+    """Sends back what comes, until it is ended; it listens once its answers are listened to."""
     with open_session(Endpoints(listen=(endpoint,))) as session:
-        there = session.declare_subscriber("there", zenoh.handlers.FifoChannel(100))
         back = session.declare_publisher("back", express=True)
+        _wait_for_listener(back)
+        there = session.declare_subscriber("there", zenoh.handlers.FifoChannel(100))
         while True:
             back.put(there.recv().payload)
 
 
-def _send(endpoint: str, path: str, period_ns: int, begin_ns: int) -> None:
+def _send(endpoint: str, path: str, begin_path: str, period_ns: int) -> None:
     """One message each period; the file has what came back, however this process ends."""
     taken_ns = np.lib.format.open_memmap(path, mode="r+")
-    begin_ns += period_ns // 2
     with open_session(Endpoints(connect=(endpoint,)), peers_follow=True) as session:
         back = session.declare_subscriber("back", zenoh.handlers.FifoChannel(100))
         there = session.declare_publisher("there", express=True)
-        while not there.matching_status.matching:
-            time.sleep(_LOOK_S)
+        _wait_for_listener(there)
+        begin_ns = _begin_ns(begin_path, 2) + period_ns // 2
         first = max(0, -(-(time.monotonic_ns() - begin_ns) // period_ns))
         for k in range(first, len(taken_ns)):
             sleep_until_ns(begin_ns + k * period_ns)
@@ -167,6 +194,11 @@ def _send(endpoint: str, path: str, period_ns: int, begin_ns: int) -> None:
             there.put(_BYTES)
             back.recv()
             taken_ns[k] = time.monotonic_ns() - sent_ns
+
+
+def _wait_for_listener(publisher: Any) -> None:
+    while not publisher.matching_status.matching:
+        time.sleep(_LOOK_S)
 
 
 def _run(work: str, realtime: Any, **task: Any) -> None:

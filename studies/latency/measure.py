@@ -148,19 +148,18 @@ def _record(
             rate_hz = director.status("controller").rate_hz
             about = {"latency": {"settings": settings.model_dump_json()}}
             recorder = stack.enter_context(Recorder(session, run.car, out / _LOG, about))
+            count = round(settings.duration_s * rate_hz)
+            begin = stack.enter_context(
+                running_beside(out, settings.load, settings.realtime, rate_hz, count)
+            )
             if track is not None and settings.attach is None:
                 limit_s = settings.warm_up_s + settings.duration_s + _AFTERWARDS_S
                 plan = RunPlan(1, "bayesrace", 0, limit_s, lockstep=False)
                 director.start(run_request(track, plan))
                 stack.callback(_stop, director)
-        begin_ns = time.monotonic_ns() + round(settings.warm_up_s * 1e9)
-        end_ns = begin_ns + round(settings.duration_s * 1e9)
-        count = round(settings.duration_s * rate_hz)
-        with (
-            running_beside(out, settings.load, settings.realtime, rate_hz, begin_ns, count),
-            stages.stage(f"record {settings.duration_s:g} s"),
-        ):
-            run.watch(director, recorder, begin_ns, end_ns)
+        begin(begin_ns := time.monotonic_ns() + round(settings.warm_up_s * 1e9))
+        with stages.stage(f"record {settings.duration_s:g} s"):
+            run.watch(director, recorder, begin_ns, begin_ns + round(settings.duration_s * 1e9))
     run.host, run.bare = socket.gethostname(), read_bare_loop(out, rate_hz)
     run.round_trip = read_round_trips(out, rate_hz)
     run.notes += [] if run.bare else ["no bare loop to compare the misses with: it was lost"]
