@@ -84,7 +84,6 @@ tools:
 	@.ci/tools
 
 rest: TIER = check
-rest: PAIRS = 4
 rest: $(VENV)/.ready-dev
 	$(RUN_TESTS)
 

@@ -99,10 +99,8 @@ def path_table_for(manifest: Manifest, car: Car, track: Track, line: RaceLine) -
     """The table that a built controller has room for; InputError if its rows would be too far
     apart."""
     tuning = car.tuning.path
-    table = make_path_table(track, line, tuning.spacing_m, manifest.path_rows)
-    if table.spacing_m > tuning.spacing_max_m:
-        manifest.check_rows(math.ceil(line.length_m / tuning.spacing_max_m))
-    return table
+    manifest.check_rows(math.ceil(line.length_m / tuning.spacing_max_m))
+    return make_path_table(track, line, tuning.spacing_m, manifest.path_rows)
 
 
 class PredictiveController:

@@ -26,11 +26,11 @@ from bayesrace.controller.pure_pursuit import dead_reckoning, turning
 from bayesrace.errors import InputError
 from bayesrace.vehicles.parameters import Car
 
-__all__ = ["KEYBOARD", "NOBODY", "Device", "Gamepad", "Keyboard", "ManualDriver"]
+__all__ = ["KEYBOARD", "NO_DRIVER", "Device", "Gamepad", "Keyboard", "ManualDriver"]
 
 KEYBOARD: Final = "keyboard"
 """In place of the device of a gamepad."""
-NOBODY: Final = 100
+NO_DRIVER: Final = 100
 """Status of a step without a driver."""
 
 _SILENT_S: Final = 1.0
@@ -62,7 +62,7 @@ class Device:
         threading.Thread(target=self._run, daemon=True, name="manual").start()
 
     def wanted(self) -> tuple[float, float] | None:
-        """Drive (1 full, -1 braking) and steering (1 left); None: nobody is there."""
+        """Drive (1 full, -1 braking) and steering (1 left); None without a driver."""
         return self._wanted() if clock.monotonic() - self._heard_s < _SILENT_S else None
 
     def _run(self) -> None:
@@ -175,10 +175,10 @@ class ManualDriver:
         elapsed_s: float = 0.0,
         budget_s: float = 0.0,
     ) -> StepOutput:
-        """What the person wants; status :data:`NOBODY` if nobody is there."""
+        """What the person wants; status :data:`NO_DRIVER` without one."""
         car, output, vx = self._car, self._output, float(x[3])
         wanted = self.device.wanted()
-        output.status = NOBODY if wanted is None else 0
+        output.status = NO_DRIVER if wanted is None else 0
         drive, steering = wanted or (0.0, 0.0)
         # Braking fades to none at standstill: the car does not drive backwards.
         lowest = car.d_min * min(max(vx / car.brake_fade_mps, 0.0), 1.0)

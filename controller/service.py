@@ -160,8 +160,8 @@ class Service:
 
     @property
     def _drives(self) -> bool:
-        """Whether the car drives and has not been told to stop: the phase changes only later, of a
-        controller elsewhere when the car stands."""
+        """Whether the car drives and no stop is requested. The phase alone would be late: that of
+        a controller in another process changes only when the car stands."""
         stopped = self._stopped or self._let_go
         return self._driver.phase in (Phase.DRIVING, Phase.FALLBACK) and not stopped
 

@@ -116,3 +116,9 @@ def browser(folder: Path) -> Iterator[Page]:
                 yield Page(link, answer["result"]["sessionId"])
         finally:
             process.kill()
+
+
+@pytest.fixture
+def page(tmp_path: Path) -> Iterator[Page]:
+    with browser(tmp_path / "browser") as page:
+        yield page

@@ -6,7 +6,6 @@ an orphan can be recognised whatever became of the race.
 
 import json
 import os
-import resource
 import socket
 import subprocess
 import sys
@@ -31,7 +30,6 @@ __all__ = [
     "finish",
     "leftovers",
     "peanut",
-    "resident_bytes",
     "run",
     "start",
     "started_by",
@@ -72,11 +70,6 @@ def finish(process: subprocess.Popen[str]) -> subprocess.CompletedProcess[str]:
         process.communicate()
         raise
     return subprocess.CompletedProcess(process.args, process.returncode, out, err)
-
-
-def resident_bytes() -> int:
-    """Memory of this process."""
-    return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
 
 
 def until(

@@ -27,10 +27,13 @@ from bayesrace.operation.system import started_system
 from bayesrace.plant.car import End
 from bayesrace.plant.vehicle import planned_at
 from bayesrace.recorder import Recorder
+from tests.exchanged import racing_host
 from tests.network.cars import free_port, started_host
 from tests.racing import Racing, prepared, racing
-from tests.recovery import bridge_command, hosted
+from tests.recovery import bridge_command
 from tests.reference import reference_file
+
+__all__ = ["racing_host"]  # a fixture
 
 CUT_S = 0.4
 """A drive that starts at speed has found its line by then."""
@@ -193,12 +196,6 @@ def lose(out: Path, what: signal.Signals | None, after_s: float, host: HostProgr
     )
 
 
-@pytest.fixture(scope="module")
-def host(tmp_path_factory: pytest.TempPathFactory) -> HostProgram:
-    """The controller without Python, for harbour."""
-    return hosted(prepared(), tmp_path_factory.mktemp("host"))
-
-
 LOSSES = (signal.SIGKILL, signal.SIGHUP, signal.SIGSTOP, None)
 MOMENTS_S = (9.0, 10.7, 12.4)
 
@@ -217,7 +214,7 @@ def test_a_controller_or_director_that_is_lost_at_racing_speed(
 ) -> None:  # fmt: skip
     """A controller killed, its terminal closed, or paused for 3 s, after which it drives on; the
     director of a held run, for good."""
-    host = request.getfixturevalue("host") if language == "C" else None
+    host = request.getfixturevalue("racing_host") if language == "C" else None
     for attempt in range(3):
         out = tmp_path / str(attempt)
         out.mkdir()

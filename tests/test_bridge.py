@@ -50,7 +50,7 @@ from bayesrace.vehicles import Car
 from tests import sample_messages as messages
 from tests.conftest import Circuit
 from tests.driven import blank
-from tests.network.cars import started_host
+from tests.network.cars import free_port, started_host
 from tests.programs import finish, run, start, until
 from tests.takeover.spoilt_weights import spoilt
 
@@ -120,9 +120,7 @@ def links(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[tuple[str,
         with serial_line() as (one, other):
             yield f"serial:{one}", f"serial:{other}", []
     elif request.param == "udp":
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
-            free.bind(("127.0.0.1", 0))
-            link = f"udp:127.0.0.1:{free.getsockname()[1]}"
+        link = f"udp:127.0.0.1:{free_port()}"
         yield link, link, []
     else:
         link, key = f"unix:{tmp_path / 'host'}", tmp_path / "key"
@@ -166,12 +164,12 @@ def test_a_drive_in_lockstep_is_that_of_one_process_to_the_bit(
     bridged: Bridged, kinematic_artefact: Path, circuit: Circuit, car: Car, weights: Weights,
     tmp_path: Path,
 ) -> None:  # fmt: skip
-    """Though the program stalls for 3 s."""
+    """Though the program stalls for 2 s; the plant waits 5 s."""
     log = tmp_path / "drive.mcap"
     drive = bridged.drive(log, "--laps", "10")
     until(lambda: log.exists() and log.stat().st_size > 20_000, "a run in progress", every_s=0.001)
     bridged.host.send_signal(signal.SIGSTOP)
-    time.sleep(3.0)
+    time.sleep(2.0)
     bridged.host.send_signal(signal.SIGCONT)
     done = finish(drive)
     assert "10 lap(s) done" in done.stdout, done.stderr
@@ -185,7 +183,7 @@ def test_a_drive_in_lockstep_is_that_of_one_process_to_the_bit(
     assert [one.seq for one in sent] == list(range(len(sent)))
     assert {one.weights_version for one in sent} == {weights.version}
     assert len(driven.select(TELEMETRY)) == len(sent) > 1000
-    assert max(b.source_time_ns - a.source_time_ns for a, b in pairwise(sent)) > 2.9e9
+    assert max(b.source_time_ns - a.source_time_ns for a, b in pairwise(sent)) > 1.9e9
 
 
 @pytest.mark.check

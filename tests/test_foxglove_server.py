@@ -21,9 +21,10 @@ from bayesrace.operation.view.foxglove import serve
 from bayesrace.scene import Scene
 from bayesrace.tracks import load_track
 from bayesrace.vehicles import get_car
+from benchmarks.harness import resident_bytes
 from tests import sample_messages as messages
 from tests.driven import blank
-from tests.programs import resident_bytes, until
+from tests.programs import until
 
 pytestmark = pytest.mark.wall_clock
 
@@ -178,10 +179,10 @@ def test_a_viewer_that_reads_nothing_holds_up_nobody_and_bounded_memory() -> Non
             begun.set()
             sender.join()
         threading.Thread(target=read, args=(quick,), daemon=True).start()
-        before = resident_bytes()
+        before = resident_bytes("self")
         for _ in range(4000):
             send()
-        held = resident_bytes() - before
+        held = resident_bytes("self") - before
         send(time_ns=2)
         until(told.is_set, "another viewer is still told")
     assert held < 2.5 * 1024 * size < 0.7 * 4000 * size

@@ -25,6 +25,7 @@ from bayesrace.errors import InputError, RestartError
 from bayesrace.messages import FrameReader, Seal, datagrams_in, framed, to_frame
 from bayesrace.messages.serial_frames import _stuffed, _unstuffed
 from tests.native_programs import PROGRAMS, SANITIZERS, STRICT, gcc
+from tests.network.cars import free_port
 
 HERE = NATIVE.parent / HOST
 SECRET = bytes(range(100, 150))
@@ -92,12 +93,6 @@ def peer(echo: Path, key: Path, tmp_path: Path, request: pytest.FixtureRequest) 
         one.bind(own)
         one.connect(there)
         yield Peer(one, process)
-
-
-def free_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
-        free.bind(("127.0.0.1", 0))
-        return int(free.getsockname()[1])
 
 
 def sealed(way: bytes, data: bytes, counter: int, secret: bytes = SECRET) -> bytes:

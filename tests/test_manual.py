@@ -13,7 +13,7 @@ import pytest
 from bayesrace.controller import manual
 from bayesrace.controller.interface import Environment
 from bayesrace.controller.manual import (
-    NOBODY,
+    NO_DRIVER,
     Device,
     Gamepad,
     Keyboard,
@@ -72,7 +72,7 @@ def test_the_sticks_are_read_as_the_kernel_reports_them(pad: int, tmp_path: Path
 def test_a_person_drives_a_car_and_the_log_is_one_to_learn_from(
     pad: int, circuit: Circuit, kinematic_artefact: Path, tmp_path: Path
 ) -> None:
-    """In simulated time, which passes faster than the second after which nobody is there."""
+    """In simulated time, which passes faster than the second after which there is no driver."""
     os.write(pad, event(DRIVE, -0.5) + event(STEERING, -0.4))
     law = ManualDriver(CAR, Gamepad(str(tmp_path / "js0")), 0.02)
     controller = PythonController(kinematic_artefact, law, circuit.track.identity)
@@ -97,11 +97,11 @@ def test_a_person_drives_a_car_and_the_log_is_one_to_learn_from(
 class Hands(Device):
     """As a test wants it."""
 
-    def __init__(self, *wanted: float) -> None:
-        self.said = wanted
+    def __init__(self, drive: float, steering: float) -> None:
+        self.said = drive, steering
 
-    def wanted(self) -> tuple[float, float] | None:
-        return (self.said[0], self.said[1]) if self.said else None
+    def wanted(self) -> tuple[float, float]:
+        return self.said
 
 
 @pytest.mark.parametrize(
@@ -152,7 +152,7 @@ def test_a_car_without_a_driver_brakes(
     driven = loop.drive(0, 6.0, watch=leave)
     assert driven.levels[:49].max() == 0
     assert driven.levels[52:].min() > 0
-    assert set(driven.statuses[52:-1]) <= {NOBODY, 253}
+    assert set(driven.statuses[52:-1]) <= {NO_DRIVER, 253}
     assert driven.x[49, 3] > 1.0
     assert abs(driven.x[-1, 3]) < 0.05
     if fault == "silent":

@@ -12,7 +12,7 @@ import pytest
 from bayesrace.operation.analysis.race import read_race
 from bayesrace.operation.analysis.results import RaceResult
 from bayesrace.operation.report import render, write_report
-from bayesrace.operation.report.maps import lap_maps
+from bayesrace.operation.report.maps import lap_map
 from bayesrace.operation.terminal.tables import COLUMNS
 from tests.command_line import Cli, refused
 from tests.synthetic_race import Drive, analyse, circle, write_race
@@ -181,7 +181,7 @@ def test_a_car_that_wanders_off_does_not_shrink_the_track(tmp_path: Path) -> Non
     far = circle(TWO_LAPS[:100], np.linspace(1.0, 50.0, 100))
     analysis = read_race(write_race(tmp_path, [Drive("worstcase", far)]))
     with figure_style():
-        (figure,) = lap_maps(analysis.runs, analysis.track, analysis.line)
+        figure = lap_map(analysis.runs[0], analysis.track, analysis.line)
     left, right = figure.axes[0].get_xlim()
     assert -1.5 < left < -1.2 < 1.2 < right < 1.5
     assert figure.axes[0].get_aspect() == 1.0

@@ -28,7 +28,7 @@ from bayesrace.operation.view.sources import all_updates, driven_race
 from bayesrace.tracks import load_track
 from bayesrace.transport import free_endpoint
 from bayesrace.vehicles import get_car, write_car
-from tests.browser import Page, browser, needs_browser
+from tests.browser import Page, needs_browser, page
 from tests.command_line import Cli, refused
 from tests.fake_processes import Fakes, fakes, where
 from tests.programs import PATIENCE_S, Race, start, until
@@ -38,18 +38,18 @@ from tests.test_drive_command import LONG, course, ended, waiting
 from tests.test_drive_command import Waiting as WaitingCar
 from tests.test_foxglove_server import viewer as viewer_of_foxglove
 
-__all__ = ["course", "ended", "fakes", "waiting"]
+__all__ = ["course", "ended", "fakes", "page", "waiting"]
 
 
-def raced(path: Path) -> Path:
-    """A race of two laps by BestCase alone."""
-    write_race(path, [Drive("bestcase", circle(TWO_LAPS, 1.05))])
+def raced(path: Path, *drives: Drive, **how: Any) -> Path:
+    """A race as a viewer reads it; without drives one of two laps by BestCase alone."""
+    write_race(path, drives or [Drive("bestcase", circle(TWO_LAPS, 1.05))], **how)
     write_car(path / "car.toml", get_car("orca"))
     return path
 
 
-def shown(path: Path) -> Source:
-    source = run_source(path)
+def shown(path: Path, car: str = "") -> Source:
+    source = run_source(path, car=car)
     source.read_all()
     return source
 
@@ -59,8 +59,7 @@ def entries(path: Path) -> list[Entry[Any]]:
 
 
 def test_rows_and_laps_are_those_of_the_analysis(peanut_race: Race) -> None:
-    source = run_source(peanut_race.out)
-    source.read_all()
+    source = shown(peanut_race.out)
     told, analysed = list(source.runs.all_updates()), read_race(peanut_race.out).runs
     laps = [[time for _, _, time in one["laps"]] for one in told]
     for own, run in zip(laps, analysed, strict=True):
@@ -81,8 +80,7 @@ def test_rows_and_laps_are_those_of_the_analysis(peanut_race: Race) -> None:
 
 
 def test_the_car_is_off_an_earlier_plan_by_less_where_the_model_is_right(peanut_race: Race) -> None:
-    source = run_source(peanut_race.out)
-    source.read_all()
+    source = shown(peanut_race.out)
     errors = {
         one["label"]: np.median(np.abs([mm for mm in one["rows"]["error_mm"] if mm is not None]))
         for one in source.runs.updates({})
@@ -203,8 +201,7 @@ def test_a_message_names_all_runs_and_has_few_rows(
 ) -> None:
     """A page finds the runs that its address names in the first one."""
     drives = [Drive(name, circle(TWO_LAPS, 1.05)) for name in ("bestcase", "worstcase")]
-    write_race(path := raced(tmp_path), drives)
-    runs, known = shown(path).runs, dict[str, tuple[int, int, int, str]]()
+    runs, known = shown(raced(tmp_path, *drives)).runs, dict[str, tuple[int, int, int, str]]()
     whole = [len(one["rows"]["t"]) for one in runs.all_updates()]
     monkeypatch.setattr("bayesrace.operation.view.runs._ROWS_AT_ONCE", 40)
     counts = [0] * len(whole)
@@ -312,12 +309,6 @@ def test_what_cannot_be_shown_is_named(cli: Cli, tmp_path: Path, monkeypatch: An
         refused(cli("view", str(path), "--port", port), port, "--port")
 
 
-@pytest.fixture
-def page(tmp_path: Path) -> Iterator[Page]:
-    with browser(tmp_path / "browser") as page:
-        yield page
-
-
 @needs_browser
 @pytest.mark.parametrize(("width", "dark"), [(1400, False), (800, True), (400, False)])
 def test_a_finished_run_is_one_file(
@@ -378,8 +369,7 @@ def test_texts_from_outside_are_texts(tmp_path: Path, page: Page) -> None:
     evil = (
         """x" style="position:fixed;inset:0" onmouseover="window.hit=1"><img src=x onerror=hit=1>"""
     )
-    path = write_race(tmp_path / "run", [Drive(evil, circle(TWO_LAPS, 1.0), ended=evil)])
-    write_car(path / "car.toml", get_car("orca"))
+    path = raced(tmp_path / "run", Drive(evil, circle(TWO_LAPS, 1.0), ended=evil))
     out = tmp_path / "page.html"
     out.write_text(whole_page(all_updates(shown(path))))
     page.open(out.as_uri())
@@ -529,12 +519,8 @@ def test_time_lost_along_the_track_is_known(tmp_path: Path, page: Page) -> None:
         Drive("bayesrace", circle(TWO_LAPS / 1.01, 1.0)),
         Drive("bestcase", circle(TWO_LAPS, 1.0)),
     ]
-    path = write_race(tmp_path / "run", drives)
-    write_car(path / "car.toml", get_car("orca"))
-    source = run_source(path)
-    source.read_all()
     out = tmp_path / "page.html"
-    out.write_text(whole_page([source.course(), *source.runs.updates({})]))
+    out.write_text(whole_page(all_updates(shown(raced(tmp_path / "run", *drives)))))
     page.open(out.as_uri() + "#lap=0")
     page.until("reference() !== null")
     lost_ms = np.array(page.value("lost(shown()[0])"), float)

@@ -16,10 +16,13 @@ from bayesrace.operation.analysis.race import read_race
 from bayesrace.operation.view import Source, run_source, whole_page
 from bayesrace.operation.view.sources import all_updates
 from bayesrace.vehicles import get_car, write_car
-from tests.browser import browser, needs_browser
+from tests.browser import Page, needs_browser, page
 from tests.programs import Race
 from tests.synthetic_race import Drive, circle, write_race
 from tests.test_analysis import TWO_LAPS
+from tests.test_view import raced, shown
+
+__all__ = ["page"]  # a fixture
 
 ROUNDED = 0.51e-5
 
@@ -33,15 +36,7 @@ def told(source: Source) -> list[tuple[Floats, Floats]]:
 
 
 def read(path: Path, car: str = "") -> list[tuple[Floats, Floats]]:
-    source = run_source(path, car=car)
-    source.read_all()
-    return told(source)
-
-
-def raced(path: Path, *drives: Drive, **how: Any) -> Path:
-    write_race(path, drives, **how)
-    write_car(path / "car.toml", get_car("orca"))
-    return path
+    return told(shown(path, car))
 
 
 def test_they_are_those_of_the_weights_that_drove(peanut_race: Race) -> None:
@@ -128,16 +123,13 @@ def test_where_nothing_is_true_they_are_of_what_was_measured(tmp_path: Path) -> 
 
 
 @needs_browser
-def test_a_chart_shows_them(peanut_race: Race, tmp_path: Path) -> None:
-    source = run_source(peanut_race.out)
-    source.read_all()
+def test_a_chart_shows_them(peanut_race: Race, tmp_path: Path, page: Page) -> None:
     out = tmp_path / "page.html"
-    out.write_text(whole_page(all_updates(source)))
-    with browser(tmp_path / "browser") as page:
-        page.open(out.as_uri() + "#lap=0")
-        page.until("plots.length >= 7")
-        chart = "plots.find((one) => one.kind.of === 'omega_error').chart"
-        low, high = page.value(f"[{chart}.scales.y.min, {chart}.scales.y.max]")
-        most = page.value("Math.max(...shown().flatMap((run) => series(run, 'omega_error')))")
-        assert -low == high > most > 0
-        assert page.errors == []
+    out.write_text(whole_page(all_updates(shown(peanut_race.out))))
+    page.open(out.as_uri() + "#lap=0")
+    page.until("plots.length >= 7")
+    chart = "plots.find((one) => one.kind.of === 'omega_error').chart"
+    low, high = page.value(f"[{chart}.scales.y.min, {chart}.scales.y.max]")
+    most = page.value("Math.max(...shown().flatMap((run) => series(run, 'omega_error')))")
+    assert -low == high > most > 0
+    assert page.errors == []

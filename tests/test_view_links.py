@@ -24,13 +24,16 @@ from bayesrace.log_rotation import RotatingLog
 from bayesrace.messages import Event, Message, Telemetry, encode
 from bayesrace.operation.view import Viewer, run_source
 from bayesrace.vehicles import get_car, write_car
+from benchmarks.harness import resident_bytes
 from tests import sample_messages as messages
-from tests.browser import Page, browser, needs_browser
+from tests.browser import Page, needs_browser, page
 from tests.driven import blank
-from tests.programs import resident_bytes, start, until
+from tests.programs import start, until
 from tests.synthetic_race import LINE_M, STEP_S, Drive, circle, write_race
 from tests.test_analysis import TWO_LAPS
 from tests.test_view import raced, shown, updates_of
+
+__all__ = ["page"]  # a fixture
 
 BUFFERS: Final = 4_500_000
 """More than a sender's and a small receiver's buffers hold of a link [bytes]."""
@@ -158,7 +161,7 @@ def test_a_page_that_stops_reading_holds_nobody_up_and_then_sees_the_newest(
                 car.drive(50)
                 viewer.read()
                 until(lambda: quick.newest[1] > car.time_s - 0.1, "the other page goes on")
-            used.append(resident_bytes())
+            used.append(resident_bytes("self"))
         assert quick.missed == 0
         assert used[1] - used[0] < 0.5 * BUFFERS
         late = Told()
@@ -241,23 +244,16 @@ def test_ipv6_is_served_with_addresses_in_brackets(tmp_path: Path) -> None:
             assert [asked(host, "/"), asked(host, f"/?{where.query}")] == [403, 200]
 
 
-@pytest.fixture
-def page(tmp_path: Path) -> Iterator[Page]:
-    with browser(tmp_path / "browser") as page:
-        yield page
-
-
 @needs_browser
 @pytest.mark.check
 def test_a_page_finds_a_viewer_again_that_was_killed_or_hung(tmp_path: Path, page: Page) -> None:
     """Its runs have the same keys as those before, and are others."""
     races = [
-        write_race(tmp_path / name, [Drive(name, circle(TWO_LAPS[:count], 1.0))])
+        raced(tmp_path / name, Drive(name, circle(TWO_LAPS[:count], 1.0)))
         for name, count in (("bestcase", 90), ("bayesrace", 60))
     ]
     port, lost = "0", "el('state').textContent.startsWith('connection lost')"
     for race, count in zip(races, (90, 60), strict=True):
-        write_car(race / "car.toml", get_car("orca"))
         view = start("view", race, "--port", port)
         try:
             assert view.stdout is not None
@@ -309,7 +305,7 @@ def test_a_long_drive_takes_no_more_memory_of_viewer_and_page(
                 until(lambda: told.newest > (car.run, car.time_s - 0.1), "it is told")
             page.until(f"runs.get('orca/1/{car.run}').rows.t.at(-1) > {car.time_s - 0.1}")
             heap.append(page.heap_bytes())
-            used.append(resident_bytes())
+            used.append(resident_bytes("self"))
             car.begin()
         assert told.missed == 0
         kept = {one["key"]: len(one["rows"]["t"]) for one in source.runs.all_updates()}

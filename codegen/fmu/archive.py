@@ -9,7 +9,7 @@ import shlex
 import tempfile
 import zipfile
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from importlib.metadata import distribution
 from math import isfinite
 from pathlib import Path
@@ -34,7 +34,7 @@ from bayesrace.files import replacing
 from bayesrace.gp.weights import Weights
 
 __all__ = [
-    "base_units", "exchange_weights", "licence_files", "pack", "rendered", "third_parties",
+    "exchange_weights", "licence_files", "pack", "rendered", "third_parties", "units_of",
     "write_archive",
 ]  # fmt: skip
 
@@ -137,13 +137,12 @@ def rendered(template: str, **values: Any) -> bytes:
 
 def _model_description(definition: FmuDefinition, token: str, linked: Sequence[str]) -> bytes:
     """``modelDescription.xml``; ``linked``: what the compiler is given."""
-    units = sorted({v.unit for v in definition.all_variables if v.unit is not None})
     return rendered(
         "modelDescription.xml",
         fmu=definition,
         token=token,
         files=[name for name in linked if name.endswith(".c")],
-        units={unit: base_units(unit) for unit in units},
+        units=units_of(definition.all_variables),
         variables=[_described(definition, *one) for one in enumerate(definition.all_variables)],
         structure=_structure(definition),
     )
@@ -158,7 +157,14 @@ def _build_description(definition: FmuDefinition, linked: Sequence[str]) -> byte
     )
 
 
-def base_units(unit: str) -> dict[str, int]:
+def units_of(variables: Iterable[Variable]) -> dict[str, dict[str, int]]:
+    """Units in use, each with its exponents of base units; InputError for others than of
+    kg, m, s and rad."""
+    names = {v.unit for v in variables if v.unit is not None}
+    return {name: _base_units(name) for name in sorted(names)}
+
+
+def _base_units(unit: str) -> dict[str, int]:
     """Exponents of kg, m, s, rad in a unit like ``N.s2/m2``; InputError if it has others."""
     exponents = dict.fromkeys(("kg", "m", "rad", "s"), 0)
     for over, name, power in re.findall(r"(/?)([A-Za-z]+|1)([0-9]*)", unit):

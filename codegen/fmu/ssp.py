@@ -5,12 +5,12 @@
 """
 
 import tempfile
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
-from bayesrace.codegen.fmu.archive import base_units, pack, rendered, write_archive
-from bayesrace.codegen.fmu.build import FmuDefinition, Variable
+from bayesrace.codegen.fmu.archive import pack, rendered, units_of, write_archive
+from bayesrace.codegen.fmu.build import FmuDefinition
 from bayesrace.errors import InputError
 from bayesrace.vehicles.models import INPUTS, STATES
 
@@ -52,7 +52,7 @@ def pack_loop(
             name=f"{car.name} and its controller",
             description=f"communication step {step_s:g} s; FMUs are stepped side by side",
             elements=elements, connectors=connectors, connections=_CONNECTIONS, stop_s=stop_s,
-            units=_units(v for found in connectors.values() for v in found),
+            units=units_of(v for found in connectors.values() for v in found),
         )
     }  # fmt: skip
     with tempfile.TemporaryDirectory(prefix="ssp-") as folder:
@@ -65,12 +65,6 @@ def pack_loop(
 
 def _parameter_set(fmu: FmuDefinition, start: Mapping[str, float]) -> bytes:
     values = [(v, repr(float(start[v.name]))) for v in fmu.variables if v.name in start]
-    units = _units(v for v, _ in values)
+    units = units_of(v for v, _ in values)
     # Both files' sets have one name, because ecos applies the sets of one name together.
     return rendered("parameters.ssv", name="start", values=values, units=units)
-
-
-def _units(variables: Iterable[Variable]) -> dict[str, dict[str, int]]:
-    """Units in use, each with its exponents of base units."""
-    names = {v.unit for v in variables if v.unit is not None}
-    return {name: base_units(name) for name in sorted(names)}

@@ -20,7 +20,7 @@ typedef struct {
     double stop_mps2;
 
     char in_use[BR_VERSION_BYTES], proven[BR_VERSION_BYTES], staged[BR_VERSION_BYTES];
-    br_mpc_trial trial; /* while on_trial: told by the loop of each state that is believed */
+    br_mpc_trial trial; /* while on_trial: the loop passes it each state that it uses */
     int on_trial;
     double limit_mps; /* to which the car slows down, until weights are adopted, also where it has
                        * gone back; 0: none */

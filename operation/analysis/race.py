@@ -48,7 +48,7 @@ from bayesrace.tracks import PathProjection, Track
 from bayesrace.tracks.spline import CentrelineSearch, PlaneSpline
 from bayesrace.vehicles import Car
 
-__all__ = ["DrivenRun", "RaceAnalysis", "line_offset", "read_race"]
+__all__ = ["DrivenRun", "LineOffset", "RaceAnalysis", "read_race"]
 
 
 _SURELY: Final = 1.5
@@ -61,13 +61,20 @@ _WEIGHTS_FILES: Final = {
 }
 
 
-def line_offset(line: RaceLine, xy: Floats, reach_m: float) -> Floats:
-    """Signed distance (n,) of a trajectory (n, 2) from the racing line, positive to its left."""
-    curve = PlaneSpline(line.s_m, line.xy_m, line.length_m)
-    s = CentrelineSearch(curve, reach_m / 16).follow(xy, None, reach_m)
-    tangent, away = curve(s, 1), xy - curve(s)
-    side = np.sign(tangent[:, 0] * away[:, 1] - tangent[:, 1] * away[:, 0])
-    return np.asarray(side * np.linalg.norm(away, axis=1))
+class LineOffset:
+    """Signed distance from the racing line, positive to its left."""
+
+    def __init__(self, track: Track, line: RaceLine) -> None:
+        self._reach_m = float(np.max(track.width_right_m + track.width_left_m))
+        self._curve = PlaneSpline(line.s_m, line.xy_m, line.length_m)
+        self._search = CentrelineSearch(self._curve, self._reach_m / 16)
+
+    def of(self, xy: Floats) -> Floats:
+        """Of the places (n, 2) of a trajectory: (n,)."""
+        s = self._search.follow(xy, None, self._reach_m)
+        tangent, away = self._curve(s, 1), xy - self._curve(s)
+        side = np.sign(tangent[:, 0] * away[:, 1] - tangent[:, 1] * away[:, 0])
+        return np.asarray(side * np.linalg.norm(away, axis=1))
 
 
 class DrivenRun:
@@ -91,8 +98,7 @@ class DrivenRun:
         xy = record.x[:, :2]
         self.on_track: PathProjection = track.project_path(xy)
         self.laps = time_laps(track, record.time_s, xy, self.on_track.s_m)
-        reach_m = float(np.max(track.width_right_m + track.width_left_m))
-        self.offset_m = line_offset(line, xy, reach_m)
+        self.offset_m = LineOffset(track, line).of(xy)
 
     @property
     def finished(self) -> bool:

@@ -47,7 +47,7 @@ RUN_COLUMNS: Final[Mapping[Topic[Any], str]] = {
     STATE: f"{STATES} source_time_ns lap lockstep",
     TRUTH: f"{TRUE_STATES} lap",
     ACTUATION: "seq run weights_version",
-    TELEMETRY: f"seq {CYCLES} solve_us tube_m pace widening",
+    TELEMETRY: f"seq {CYCLES} solve_us",
     EVENT: "run source kind text data",
 }
 """What is read of a run, in the order of the fields of a :class:`RunRecord`."""

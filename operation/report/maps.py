@@ -1,6 +1,5 @@
 """Tracks: with laps by speed, or alone with the map that they were made of, to check them by."""
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -36,7 +35,7 @@ from bayesrace.tracks import Track
 if TYPE_CHECKING:
     from bayesrace.tracks.maps import RosMap
 
-__all__ = ["check_picture", "draw_edges", "lap_maps", "show_all", "write_picture"]
+__all__ = ["check_picture", "draw_edges", "lap_map", "show_all", "write_picture"]
 
 _MARGIN_M: Final = 0.12
 _SCALE: Final = 0.85
@@ -50,20 +49,15 @@ _EDGE: Final = "#0072B2"
 _SHADES: Final = {"free": 255, "unknown": 200, "occupied": 90}
 
 
-def lap_maps(runs: Sequence[DrivenRun], track: Track, line: RaceLine) -> list[Figure]:
-    """The first lap of each run on the track, coloured by speed; later laps as a thin line.
+def lap_map(run: DrivenRun, track: Track, line: RaceLine) -> Figure:
+    """The first lap of a run on the track, coloured by speed; later laps as a thin line.
 
     Off-track samples are those that the result table counts; a run without a lap is shown until the
-    car left out a piece of the track.
+    car left out a piece of the track. Map and scale are at fixed places: a layout by what is drawn
+    would draw everything twice.
     """
-    top = [float(np.max(run.record.x[run.counted, 3], initial=0.0)) for run in runs]
-    speed = Normalize(0.0, max([*top, float(line.vx_mps.max())]))
-    return [_lap_map(run, track, line, speed) for run in runs]
-
-
-def _lap_map(run: DrivenRun, track: Track, line: RaceLine, speed: Normalize) -> Figure:
-    """A map and its scale, at fixed places: a layout by what is drawn would draw everything
-    twice."""
+    fastest = float(np.max(run.record.x[run.counted, 3], initial=0.0))
+    speed = Normalize(0.0, max(fastest, float(line.vx_mps.max())))
     edges = track.boundaries(0.04)
     corners = np.concatenate(edges)
     width, height = np.ptp(corners, axis=0) + 2 * _MARGIN_M

@@ -67,15 +67,10 @@ class _Trace(NamedTuple):
     """Drawn as dotted lines."""
 
 
-def _panel(track: Track, title: str, label: str, height: float = 2.0) -> tuple[Figure, Axes]:
-    figure, axes = panel(height)
-    axes.set(title=title, ylabel=label, xlabel="distance along the centreline s [m]")
-    axes.set_xlim(0, track.length_m)
-    return figure, axes
-
-
 def _figure(track: Track, laps: Sequence[_Lap], trace: _Trace) -> Figure:
-    figure, axes = _panel(track, trace.title, trace.label)
+    figure, axes = panel(2.0)
+    axes.set(title=trace.title, ylabel=trace.label, xlabel="distance along the centreline s [m]")
+    axes.set_xlim(0, track.length_m)
     for limit in trace.limits:
         axes.axhline(limit, color=INK, linewidth=0.6, linestyle=_DOTS)
     for lap in laps:

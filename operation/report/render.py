@@ -19,7 +19,7 @@ from bayesrace.operation.analysis.results import RaceResult, write_result
 from bayesrace.operation.look import look
 from bayesrace.operation.report.coverage import coverage_figures
 from bayesrace.operation.report.gp import gp_figures
-from bayesrace.operation.report.maps import lap_maps
+from bayesrace.operation.report.maps import lap_map
 from bayesrace.operation.report.panels import cornering_figure, solve_figure
 from bayesrace.operation.report.style import figure_style, inline_svg
 from bayesrace.operation.terminal import UNCERTAIN
@@ -72,7 +72,6 @@ def _page(run_dir: Path, analysis: RaceAnalysis, figures: Mapping[str, Sequence[
         uncertain=_uncertain(analysis),
         period_us=_period_us(analysis),
         limit_sigma=UNCERTAIN,
-        caution=analysis.recording.settings.mpc.caution,
         title=f"{result.settings.track} · {analysis.track.length_m:.2f} m",
         view=_view(run_dir, analysis),
     )
@@ -164,10 +163,7 @@ def _figures(analysis: RaceAnalysis) -> Iterator[tuple[str, list[Figure]]]:
         yield "gp", gp_figures(analysis.validations, progress, track.length_m)
     drives = [analysis.training, *analysis.practices.values()]
     driven = zip(drives, [recording.training, *recording.practices], strict=True)
-    maps = [
-        figure for run, on in driven if run and on
-        for figure in lap_maps([run], on.track, on.line)
-    ]  # fmt: skip
+    maps = [lap_map(run, on.track, on.line) for run, on in driven if run and on]
     if analysis.coverage is not None:
         maps += coverage_figures(analysis.coverage, track, line)
     if maps:

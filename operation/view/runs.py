@@ -18,7 +18,7 @@ from bayesrace.arrays import Floats
 from bayesrace.log import Entry
 from bayesrace.messages import QUANTITIES, Actuation, Event, State, Telemetry, Truth
 from bayesrace.operation.analysis.laps import SHORT_CUT
-from bayesrace.operation.analysis.race import line_offset
+from bayesrace.operation.analysis.race import LineOffset
 from bayesrace.operation.analysis.recording import RUN_EVENT, PlannedRun
 from bayesrace.operation.look import Look, look
 from bayesrace.operation.view.errors import StepErrors
@@ -91,7 +91,7 @@ class _Run:
     """One run of a car, in columns."""
 
     def __init__(
-        self, car: str, shown: Look, track: Track | None, line: RaceLine | None, begin_s: float,
+        self, car: str, shown: Look, track: Track | None, offset: LineOffset | None, begin_s: float,
         errors: StepErrors | None,
     ) -> None:  # fmt: skip
         """``car``: empty where the car's name is the label, for want of a controller's."""
@@ -107,7 +107,7 @@ class _Run:
         """Row, points (columns x and y), tube [m] at all points but the first."""
         self.text = ""
         """Why it has ended."""
-        self._track, self._line, self._begin_s, self._errors = track, line, begin_s, errors
+        self._track, self._offset, self._begin_s, self._errors = track, offset, begin_s, errors
         self._open: dict[int, dict[str, Any]] = {}
         """Rows by the number of their state. What is said of it may come before it."""
         self._closed = -1
@@ -116,9 +116,7 @@ class _Run:
         self._planned: deque[tuple[float, Any, Sequence[float]]] = deque(maxlen=_MOST_PLANS)
         """Time and plans of the last rows."""
         self._planned_s = -math.inf
-        self._reach_m = 0.0
         if track is not None:
-            self._reach_m = float(np.max(track.width_right_m + track.width_left_m))
             start = StartLine(track)
             self._start = LineCounter(*track.start_pose(), start.left_m, start.right_m)
         self._last: tuple[float, float] | None = None
@@ -140,13 +138,8 @@ class _Run:
         for seq, arrival_s, _ in zip(*[iter(state.actuation_delays)] * 3, strict=True):
             if (row := self._open.get(int(seq))) is not None:
                 row["answer_ms"] = 1e3 * arrival_s
-        if "true" in self._row(state.seq):
-            return
-        if not state.estimated:
+        if "true" not in self._row(state.seq):
             self._place(state)
-        else:
-            row = self._row(state.seq)
-            row |= {"t": state.time_s, "d": state.u_applied[0], "lap": state.lap}
 
     def _row(self, seq: int) -> dict[str, Any]:
         """The open row of a state."""
@@ -155,7 +148,8 @@ class _Run:
     def _place(self, sample: State | Truth) -> None:
         row = self._row(sample.seq)
         row |= {"t": sample.time_s, "d": sample.u_applied[0], "lap": sample.lap}
-        row |= {"sample": sample, **_pose(sample.x)}
+        if not (isinstance(sample, State) and sample.estimated):
+            row |= {"sample": sample, **_pose(sample.x)}
 
     def truth(self, truth: Truth) -> None:
         """Where the car has really been goes before what was measured."""
@@ -243,8 +237,8 @@ class _Run:
         self._count(rows, xy, found.s_m, length)
         for row, s in zip(rows, (found.progress_m + laps * length).tolist(), strict=True):
             row["s"] = s
-        if self._line is not None:
-            aside_m = line_offset(self._line, xy, self._reach_m).tolist()
+        if self._offset is not None:
+            aside_m = self._offset.of(xy).tolist()
             for row, aside in zip(rows, aside_m, strict=True):
                 row["aside_m"] = aside
 
@@ -320,7 +314,8 @@ class Runs:
         self, track: Track | None = None, line: RaceLine | None = None,
         errors: StepErrors | None = None,
     ) -> None:  # fmt: skip
-        self._track, self._line, self._errors = track, line, errors
+        self._track, self._errors = track, errors
+        self._offset = None if track is None or line is None else LineOffset(track, line)
         self._runs: dict[str, _Run] = {}
         self._by_number: dict[tuple[str, int], _Run] = {}
         self._names: dict[tuple[str, int], str] = {}
@@ -370,7 +365,7 @@ class Runs:
         shown = look(controller, number if number > 1 else None, order)
         of = car if place in self._names else ""
         own = None if controller == "bestcase" else self._errors  # its model is another one
-        run = _Run(of, shown, self._track, self._line, state.time_s - 1, own)
+        run = _Run(of, shown, self._track, self._offset, state.time_s - 1, own)
         for other, one in self._runs.items():
             if other.startswith(f"{car}/") and not one.text:
                 one.text = "the end of this run is not known"

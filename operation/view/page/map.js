@@ -65,22 +65,23 @@ function drawMap() {
       { x, y } = run.rows;
     stroke(way(x.slice(first, last + 1), y.slice(first, last + 1)), paint(run), 1.1, run.dash);
   }
-  if (main && lapOf(main)) drawLoss(main);
+  const loss = main && lapOf(main) ? lossOnEachMetre(main) : null;
+  if (loss) drawLoss(main, loss);
   if (at) drawPlan(main, at.row);
   for (const run of some) drawCar(run, rowAt(run), run === main);
-  sayLegend(main);
+  sayLegend(main, loss);
 }
 
 // What the map's colours say, in words.
-function sayLegend(main) {
+function sayLegend(main, loss) {
   const ref = reference();
   let text = "";
-  if (main && lapOf(main)) {
+  if (loss) {
     text = `${main.label}: the thick line is its path, the thin one ahead of the car its plan, in the tube where the car may be.`;
     if (ref && ref !== main)
-      text += ` Red: loses ${number(lossOnEachMetre(main).size, 1)} ms or more on a metre to ${ref.label}; blue: gains; grey: neither.`;
+      text += ` Red: loses ${number(loss.size, 1)} ms or more on a metre to ${ref.label}; blue: gains; grey: neither.`;
   }
-  el("legend").textContent = text;
+  say(el("legend"), text);
 }
 
 // A run's colour, made lighter where the page is dark.
@@ -148,13 +149,12 @@ function lossOnEachMetre(run) {
   return { rate, size: rate.map(Math.abs).sort((a, b) => a - b)[Math.floor(0.95 * GRID)] || 1 };
 }
 
-function drawLoss(run) {
+function drawLoss(run, { rate, size }) {
   const lap = lapOf(run),
     same = reference() === run,
     { x, y, s, t } = run.rows,
     L = length();
-  const { rate, size } = lossOnEachMetre(run),
-    [gain, lose, calm] = ["--gain", "--loss", "--muted"].map(css);
+  const [gain, lose, calm] = ["--gain", "--loss", "--muted"].map(css);
   pen.lineCap = "round";
   for (let i = lap.first + 1; i <= lap.last; i++) {
     const at = course.length ? s[i] - lap.k * L : t[i],

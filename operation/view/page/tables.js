@@ -142,14 +142,13 @@ const SAID = [
 function drawCursor() {
   const run = active(),
     at = run && rowAt(run);
-  el("cursor").textContent = "";
-  if (!at) return;
+  if (!at) return say(el("cursor"), "");
   const lap = lapOf(run),
     s = value(run, "s", at);
   const place = s === null ? "" : `s = ${number(Math.max(0, s - lap.k * length()), 2)} m, `;
   const said = SAID.filter(([name]) => value(run, name, at) !== null).map(
     ([name, words, digits]) => `${words} ${number(value(run, name, at), digits)}`,
   );
-  el("cursor").textContent =
-    `Now: ${run.label} at ${place}${number(value(run, "t", at) - lap.begin, 3)} s: ${said.join(", ")}`;
+  const when = number(value(run, "t", at) - lap.begin, 3);
+  say(el("cursor"), `Now: ${run.label} at ${place}${when} s: ${said.join(", ")}`);
 }
