@@ -38,12 +38,11 @@ from bayesrace.gp.weights import FEATURES, GpOutput, Weights
 from bayesrace.integrators import Discretisation
 from bayesrace.learning.dataset import MIRRORED_FEATURES, MIRRORED_OUTPUTS, Dataset
 from bayesrace.learning.drives import Drive, Estimates, Event, Measured
+from bayesrace.learning.kalman import HEADING, OFFSETS
 from bayesrace.learning.smoothing import (
     blurred,
     corrected_steps,
-    innovation,
     inputs_of,
-    observation,
     period_begins,
     started,
 )
@@ -284,8 +283,8 @@ class _Belief:
         discretisation: Discretisation,
         weights: Weights,
     ) -> "_Chain":
-        columns, rows = inputs_of(events[1:]), period_begins(events)
-        u, h, begin = columns[0].T, columns[1][0], path[rows, :_NX]
+        (u, h), rows = inputs_of(events[1:]), period_begins(events)
+        begin = path[rows, :_NX]
         states = np.array([one.period for one in events])
         states[0] = states[states >= 0][0] - 1  # the first pose is within the period after it
         learned = np.isin(states[rows], samples)
@@ -323,17 +322,25 @@ class _Belief:
         self._xw = slope @ self._xw + by_g @ gw
 
     def _update(self, measured: Measured) -> None:
-        """By a reading."""
-        h = observation(measured.states, _NB)
-        factor = np.linalg.cholesky(h @ self._xx @ h.T + np.diag(measured.variance))
-        white = np.linalg.solve(factor, innovation(measured, self._x[None], h)[0])
-        by_x, by_w = (np.linalg.solve(factor, h @ one) for one in (self._xx, self._xw))
-        self._x += by_x.T @ white
-        self._w += by_w.T @ white
-        self._xx -= by_x.T @ by_x
-        self._xw -= by_x.T @ by_w
-        self._later[self._count : self._count + len(by_w)] = by_w
-        self._count += len(by_w)
+        """By a reading, one number after the other."""
+        numbers = zip(measured.states, measured.value, measured.variance, strict=True)
+        for state, value, variance in numbers:
+            by_x, by_w, new = self._xx[state], self._xw[state], value - self._x[state]
+            s = by_x[state] + variance
+            if (offset := OFFSETS.get(state)) is not None:
+                by_x, by_w = by_x + self._xx[offset], by_w + self._xw[offset]
+                s, new = by_x[state] + by_x[offset] + variance, new - self._x[offset]
+            if state == HEADING:
+                new = np.remainder(new + np.pi, 2 * np.pi) - np.pi
+            if not s > 0:
+                raise np.linalg.LinAlgError("the readings cannot be followed")
+            by_x, by_w, white = by_x / np.sqrt(s), by_w / np.sqrt(s), new / np.sqrt(s)
+            self._x += by_x * white
+            self._w += by_w * white
+            self._xx -= np.outer(by_x, by_x)
+            self._xw -= np.outer(by_x, by_w)
+            self._later[self._count] = by_w
+            self._count += 1
         if self._count >= _LATER:
             self._settle()
 

@@ -16,7 +16,8 @@ from bayesrace.integrators import PREDICTION, Discretisation
 from bayesrace.learning.conditioning import conditioned
 from bayesrace.learning.dataset import ROUNDING, Dataset, consecutive
 from bayesrace.learning.drives import Drive, Estimates
-from bayesrace.learning.smoothing import Smoothed, corrected_steps, smooth
+from bayesrace.learning.kalman import Smoothed
+from bayesrace.learning.smoothing import corrected_steps, smooth
 from bayesrace.vehicles.parameters import Car
 
 __all__ = ["learned_in_turns", "smoothed_again", "smoothed_states"]

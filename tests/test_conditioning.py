@@ -16,8 +16,9 @@ from bayesrace.learning.conditioning import conditioned
 from bayesrace.learning.dataset import Dataset, concatenate
 from bayesrace.learning.drives import Drive, Estimates
 from bayesrace.learning.estimates import smoothed_again
+from bayesrace.learning.kalman import Smoothed
 from bayesrace.learning.settings import TrainingSettings
-from bayesrace.learning.smoothing import Smoothed, corrected_steps, smooth
+from bayesrace.learning.smoothing import corrected_steps, smooth
 from bayesrace.learning.training import fit
 from bayesrace.learning.validation import predictive_sigma, residual
 from bayesrace.vehicles import Car

@@ -21,8 +21,9 @@ from bayesrace.learning import smoothing
 from bayesrace.learning.dataset import Dataset, concatenate
 from bayesrace.learning.drives import Drive
 from bayesrace.learning.gaussian_process import PairDistances, likelihood
+from bayesrace.learning.kalman import Smoothed
 from bayesrace.learning.settings import TrainingSettings
-from bayesrace.learning.smoothing import Smoothed, smooth
+from bayesrace.learning.smoothing import smooth
 from bayesrace.learning.sources import (
     CYCLES,
     STATES,
