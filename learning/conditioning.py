@@ -37,8 +37,7 @@ from bayesrace.gp.expression import kernel_matrix
 from bayesrace.gp.weights import FEATURES, GpOutput, Weights
 from bayesrace.integrators import Discretisation
 from bayesrace.learning.dataset import MIRRORED_FEATURES, MIRRORED_OUTPUTS, Dataset
-from bayesrace.learning.drives import Drive, Estimates, Event, Measured
-from bayesrace.learning.kalman import HEADING, OFFSETS
+from bayesrace.learning.drives import HEADING, OFFSETS, Drive, Estimates, Event, Measured
 from bayesrace.learning.smoothing import (
     blurred,
     corrected_steps,
@@ -334,7 +333,8 @@ class _Belief:
                 new = np.remainder(new + np.pi, 2 * np.pi) - np.pi
             if not s > 0:
                 raise np.linalg.LinAlgError("the readings cannot be followed")
-            by_x, by_w, white = by_x / np.sqrt(s), by_w / np.sqrt(s), new / np.sqrt(s)
+            deviation = np.sqrt(s)
+            by_x, by_w, white = by_x / deviation, by_w / deviation, new / deviation
             self._x += by_x * white
             self._w += by_w * white
             self._xx -= np.outer(by_x, by_x)

@@ -17,25 +17,24 @@ import numpy as np
 from scipy.special import chdtri
 
 from bayesrace.arrays import Flags, Floats, Rows
-from bayesrace.learning.drives import Event, Measured
+from bayesrace.learning.drives import HEADING, OFFSETS, Event, Measured
 
-__all__ = ["HEADING", "OFFSETS", "Filtered", "Smoothed", "Transition", "backward", "forward"]
+__all__ = ["Filtered", "Smoothed", "Transition", "backward", "forward"]
 
 _NX: Final = 7
 _NB: Final = 9
 _EXCEEDED: Final = {n: float(chdtri(n, 0.001)) for n in range(1, _NX + 1)}
 """Squared distances that one of 1,000 right readings exceeds, as in the C code."""
-OFFSETS: Final = {5: 7, 6: 8}
-"""States that are read with an offset, and which one that is."""
-HEADING: Final = 2
 _REFUSED: Final = 5
-"""Readings of an instrument in a row: then it is the filter that is wrong."""
+"""After so many refused readings of an instrument in a row the next one is taken in: the filter is
+wrong then, not the instrument."""
 _ROUNDING: Final = 1e-13
-"""Of the covariance ahead, in its own scale: it may be singular."""
+"""Added to the diagonal of the scaled predicted covariance, which may be singular."""
 
 Transition = Callable[[int, Floats], tuple[Floats, Floats, Floats]]
-"""Number of an event and states (b, m) after the one before to states before it, their derivatives
-(.., m, m) by the former, and the covariance (.., m, m) that is added."""
+"""Takes the number of an event and the states (b, m) after the event before. Returns the predicted
+states, their derivatives (.., m, m) by those, and the covariance (.., m, m) that the step adds,
+which hold until the next call."""
 
 
 @dataclass(eq=False)
@@ -44,8 +43,8 @@ class Filtered:
 
     x: Floats  # (e, b, m), after each event
     p: Floats  # (e, b, m, m)
-    ahead: Floats  # (e, b, m), before each event
-    p_ahead: Floats  # (e, b, m, m)
+    predicted: Floats  # (e, b, m), before the reading of each event
+    p_predicted: Floats  # (e, b, m, m)
     f: Floats  # (e, b, m, m), from the event before
     likelihood: Floats  # (b,)
     refused: Flags  # (e, b)
@@ -84,28 +83,30 @@ def forward(
     """The filter from ``x0`` (b, m) and ``p0`` (b, m, m) after the first event on."""
     (b, m), e = x0.shape, len(events)
     means, covariances = np.zeros((2, e, b, m)), np.zeros((3, e, b, m, m))
-    made = Filtered(
+    filtered = Filtered(
         means[0], covariances[0], means[1], covariances[1], covariances[2],
         np.zeros(b), np.zeros((e, b), np.bool_),
     )  # fmt: skip
     refused = {one.measured.instrument: np.zeros(b, np.int64) for one in events if one.measured}
     x, p = x0, p0
-    made.x[0], made.p[0] = x, p
+    filtered.x[0], filtered.p[0] = x, p
     for i in range(1, e):
         event = events[i]
         if event.duration_s > 0:
             x, f, q = go(i, x)
-            p = f @ p @ np.swapaxes(f, -1, -2) + q
-            made.f[i] = f
+            p = f @ p @ np.swapaxes(f, -1, -2)
+            # An asymmetry of rounding would grow in an unstable model: no reading lessens it.
+            p = (p + np.swapaxes(p, -1, -2)) / 2 + q
+            filtered.f[i] = f
         else:
-            made.f[i] = np.eye(m)
-        made.ahead[i], made.p_ahead[i] = x, p
+            filtered.f[i] = np.eye(m)
+        filtered.predicted[i], filtered.p_predicted[i] = x, p
         if event.measured is not None:
             own = refused[event.measured.instrument]
-            x, p, passed = _updated(x, p, event.measured, gate, made.likelihood, own)
-            made.refused[i] = ~passed
-        made.x[i], made.p[i] = x, p
-    return made
+            x, p, passed = _updated(x, p, event.measured, gate, filtered.likelihood, own)
+            filtered.refused[i] = ~passed
+        filtered.x[i], filtered.p[i] = x, p
+    return filtered
 
 
 def _updated(
@@ -127,8 +128,9 @@ def _updated(
             s = hp[:, state] + hp[:, offset] + variance
         if state == HEADING:
             new = np.remainder(new + np.pi, 2 * np.pi) - np.pi
-        root = hp / np.sqrt(s)[:, None]  # its square is symmetric to the bit
-        x, p = x + root * (new / np.sqrt(s))[:, None], p - root[:, :, None] * root[:, None]
+        deviation = np.sqrt(s)[:, None]
+        by = hp / deviation
+        x, p = x + by * (new[:, None] / deviation), p - by[:, :, None] * by[:, None]
         squared += new**2 / s
         log_s += np.log(s)
     if gate == 0:
@@ -144,21 +146,21 @@ def _updated(
     return x, p, passed
 
 
-def backward(events: Sequence[Event], made: Filtered) -> Smoothed:
+def backward(events: Sequence[Event], filtered: Filtered) -> Smoothed:
     """What all readings say of the states, from a filter of one variant."""
-    x, p, ahead = made.x[:, 0].copy(), made.p[:, 0].copy(), made.p_ahead[1:, 0]
+    x, p, predicted = filtered.x[:, 0].copy(), filtered.p[:, 0].copy(), filtered.p_predicted[1:, 0]
     m = x.shape[1]
-    scale = np.sqrt(np.einsum("nii->ni", ahead))
+    scale = np.sqrt(np.einsum("nii->ni", predicted))
     scale[scale == 0] = 1
-    scaled = ahead / (scale[:, :, None] * scale[:, None]) + _ROUNDING * np.eye(m)
-    gains = np.linalg.solve(scaled, made.f[1:, 0] @ p[:-1] / scale[:, :, None])
+    scaled = predicted / (scale[:, :, None] * scale[:, None]) + _ROUNDING * np.eye(m)
+    gains = np.linalg.solve(scaled, filtered.f[1:, 0] @ p[:-1] / scale[:, :, None])
     gains = gains.transpose(0, 2, 1) / scale[:, None]
     ends = np.array([i for i, one in enumerate(events) if one.period >= 0])
     cross, since, end = list[Floats](), np.eye(m), ends[-1]
     for i in range(len(events) - 2, -1, -1):
         gain = gains[i]
-        x[i] += gain @ (x[i + 1] - made.ahead[i + 1, 0])
-        p[i] += gain @ (p[i + 1] - ahead[i]) @ gain.T
+        x[i] += gain @ (x[i + 1] - filtered.predicted[i + 1, 0])
+        p[i] += gain @ (p[i + 1] - predicted[i]) @ gain.T
         p[i] = (p[i] + p[i].T) / 2
         since = gain @ since
         if events[i].period >= 0:
@@ -168,4 +170,4 @@ def backward(events: Sequence[Event], made: Filtered) -> Smoothed:
     rows = np.array([events[i].period for i in ends])
     mixed = np.array(cross[::-1]).reshape(len(ends) - 1, m, m)[:, :_NB, :_NB]
     kept = x[ends, :_NB], p[ends, :_NB, :_NB], mixed
-    return Smoothed(rows, *kept, x, made.refused[:, 0])
+    return Smoothed(rows, *kept, x, filtered.refused[:, 0])

@@ -23,7 +23,6 @@ run's the wheels are straight, later the controller's estimate is as good as it 
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import cache
 from itertools import product
 from typing import Any, Final, NamedTuple
 
@@ -121,26 +120,29 @@ def inputs_of(events: Sequence[Event]) -> tuple[Floats, Floats]:
     return np.array([one.u for one in events]), np.array([one.duration_s for one in events])
 
 
-class _Rows:
-    """A CasADi function of columns, for ``count`` rows at once, without the conversions of a call,
-    which take longer than the function does."""
+class _Batched:
+    """Evaluates a CasADi function for ``count`` rows at once, in buffers of its own: the
+    conversions of an ordinary call take longer than the function."""
 
-    def __init__(self, function: Any, count: int) -> None:
-        self._buffer, self._evaluate = function.map(count, "serial").buffer()
-        self._given = [np.zeros((count, function.size1_in(i))) for i in range(function.n_in())]
-        sizes = [function.size_out(i)[::-1] for i in range(function.n_out())]  # column by column
-        self._found = [np.zeros((count, *size)) for size in sizes]
+    def __init__(self, name: str, given: Sequence[Any], results: Sequence[Any], count: int) -> None:
+        """Of the expressions ``results`` in the columns ``given``."""
+        function = ca.Function(name, given, [ca.densify(one) for one in results])
+        every: Any = function.map(count, "serial")
+        self._buffer, self._evaluate = every.buffer()
+        self._given = [np.zeros((count, one.size1())) for one in given]
+        # CasADi writes a matrix column by column.
+        self._results = [np.zeros((count, *one.size()[::-1])) for one in results]
         for i, array in enumerate(self._given):
             self._buffer.set_arg(i, array.data)
-        for i, array in enumerate(self._found):
+        for i, array in enumerate(self._results):
             self._buffer.set_res(i, array.data)
 
     def __call__(self, *given: Floats) -> list[Floats]:
-        """Matrices (count, n, m) of each result, overwritten by the next call."""
+        """A matrix (count, n, m) of each result; they hold until the next call."""
         for own, one in zip(self._given, given, strict=True):
             own[:] = one
         self._evaluate()
-        return [one.transpose(0, 2, 1) for one in self._found]
+        return [one.transpose(0, 2, 1) for one in self._results]
 
 
 def period_begins(events: Sequence[Event]) -> Rows:
@@ -240,34 +242,34 @@ def corrected_steps(
         z, period = _periods(begin, u)
         features = ca.SX.sym("z", 6)
         found = mean_function(weights)(features)
-        at = ca.Function("gp", [features], [found, ca.densify(ca.jacobian(found, features))])
-        means, gradients = _Rows(at, len(z))(z)
+        gp = _Batched("gp", [features], [found, ca.jacobian(found, features)], len(z))
+        means, gradients = gp(z)
         mean = means[period, :, 0]
         gradient = share[:, None, None] * gradients[period]
     one, v, e = ca.SX.sym("x", 7), ca.SX.sym("u", 2), ca.SX.sym("e", 3)
     part = ca.SX.sym("h")
     next_x = discretisation.over(NOMINAL(car))(one, v, e, part)
-    results = [next_x, *(ca.densify(ca.jacobian(next_x, by)) for by in (one, e))]
-    step = _Rows(ca.Function("step", [one, v, part, e], results), count)
+    results = [next_x, ca.jacobian(next_x, one), ca.jacobian(next_x, e)]
+    step = _Batched("step", [one, v, part, e], results, count)
     ahead, slope, by_error = step(x, u, h[:, None], share[:, None] * mean)
     slope[:, :, 3:] += by_error @ gradient[:, :, :4]
     return Steps(ahead[..., 0], slope, by_error, mean)
 
 
-@cache
-def _walk() -> ca.Function:
-    """(x, u, h) -> x_next, its derivatives, and the covariances (12, 12 * 3) that white jerk of
-    density 1 along the car, across it and about it adds; x (12,) ends with the accelerations."""
+def _walk(count: int) -> _Batched:
+    """(x, u, h) -> x_next, its derivatives, and the covariances (36, 12) that white jerk of density
+    1 along the car, across it and about it adds, one below the other; x (12,) ends with the
+    accelerations."""
     x, u, h = ca.SX.sym("x", _NB + 3), ca.SX.sym("u", 2), ca.SX.sym("h")
     velocities = x[3:6] + h * x[_NB:]
     pose = pose_from_velocities(x, velocities, h)
-    ahead = ca.vertcat(pose, velocities, x[6] + h * u[1], x[7:])
-    results = [ahead, ca.jacobian(ahead, x), ca.horzcat(*_jerk(h, x[2]))]
-    return ca.Function("walk", [x, u, h], [ca.densify(one) for one in results])
+    after = ca.vertcat(pose, velocities, x[6] + h * u[1], x[7:])
+    results = [after, ca.jacobian(after, x), ca.vertcat(*_jerk(h, x[2]))]
+    return _Batched("walk", [x, u, h], results, count)
 
 
 def _jerk(h: Any, psi: Any) -> list[Any]:
-    """What white jerk adds within h, of each axis."""
+    """Covariances (12, 12) that white jerk of density 1 along each axis adds within h."""
     part = ca.blockcat([
         [h**5 / 20, h**4 / 8, h**3 / 6], [h**4 / 8, h**3 / 3, h**2 / 2], [h**3 / 6, h**2 / 2, h],
     ])  # fmt: skip
@@ -298,7 +300,7 @@ def _walked(events: Sequence[Event], drive: Drive, car: Car) -> Smoothed:
             part, x = events[first:last], path[first] if first else x0[0]
             go = _along(part, path[first:last], tried)
             found += forward(part, np.tile(x, (len(tried), 1)), p, go, gate).likelihood
-        density = tried[[int(np.argmax(found))]]
+        density = tried[[int(np.argmax(np.nan_to_num(found, nan=-np.inf)))]]
     loose = _along(events, path, _LOOSER * density)
     refused = forward(events, x0, p0, loose, gate).refused[:, 0]
     kept = [one.without() if wrong else one for one, wrong in zip(events, refused, strict=True)]
@@ -309,7 +311,9 @@ def _walked(events: Sequence[Event], drive: Drive, car: Car) -> Smoothed:
 def _windows(events: Sequence[Event]) -> list[tuple[int, int]]:
     """First event, a pose, and end of each window; the first one is where the drive begins."""
     count, periods = _SEARCHED
-    poses = [i for i, one in enumerate(events) if one.measured and one.measured.states[:3] == POSE]
+    poses = [
+        i for i, one in enumerate(events[:-1]) if one.measured and one.measured.states[:3] == POSE
+    ]
     passed = np.cumsum([one.period >= 0 for one in events])
     if passed[-1] <= count * periods:
         return [(0, len(events))]
@@ -321,8 +325,8 @@ def _windows(events: Sequence[Event]) -> list[tuple[int, int]]:
 def _along(events: Sequence[Event], path: Floats, density: Floats) -> Transition:
     """The random walk linearised along the path (e, 12), for densities (b, 3) of the jerk."""
     before, (u, h), m = path[:-1], inputs_of(events[1:]), path.shape[1]
-    after, f, jerk = _Rows(_walk(), len(before))(before, u, h[:, None])
-    q = jerk.transpose(0, 2, 1).reshape(-1, 3, m * m)
+    after, f, jerk = _walk(len(before))(before, u, h[:, None])
+    q = jerk.reshape(-1, 3, m * m)
 
     def go(i: int, x: Floats) -> tuple[Floats, Floats, Floats]:
         added = (density @ q[i - 1]).reshape(-1, m, m)
@@ -332,12 +336,11 @@ def _along(events: Sequence[Event], path: Floats, density: Floats) -> Transition
 
 
 def _stepwise(events: Sequence[Event], density: Floats) -> Transition:
-    """The same linearised at what is believed, for one density (1, 3)."""
-    (u, h), walk, m = inputs_of(events[1:]), _Rows(_walk(), 1), _NB + 3
+    """The random walk linearised at the current estimate, for one density (1, 3) of the jerk."""
+    (u, h), walk, m = inputs_of(events[1:]), _walk(1), _NB + 3
 
     def go(i: int, x: Floats) -> tuple[Floats, Floats, Floats]:
-        ahead, f, jerk = walk(x, u[i - 1], h[i - 1])
-        added = density @ jerk.transpose(0, 2, 1).reshape(3, m * m)
-        return ahead[..., 0].copy(), f[0], added.reshape(1, m, m)
+        after, f, jerk = walk(x, u[i - 1], h[i - 1])
+        return after[..., 0].copy(), f[0], (density @ jerk.reshape(3, m * m)).reshape(1, m, m)
 
     return go

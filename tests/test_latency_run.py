@@ -23,6 +23,9 @@ from bayesrace.operation.preparation import Prepared, prepare
 from bayesrace.operation.run_plan import RunPlan, run_request
 from bayesrace.operation.settings import PreparationSettings
 from bayesrace.operation.terminal.terminal import stages_on
+from bayesrace.realtime import RealtimeSettings
+from bayesrace.studies.latency import beside
+from bayesrace.studies.latency.beside import read_bare_loop, read_round_trips, running_beside
 from bayesrace.studies.latency.legs import BESIDE, LEGS
 from bayesrace.studies.latency.measure import _wait_for_run
 from bayesrace.tracks import Track
@@ -184,6 +187,16 @@ def test_killed_measurement_takes_its_children_along(files: Prepared, tmp_path: 
     process.kill()
     finish(process)
     until(lambda: not _with_parent(process.pid), "children ended", 20.0)
+
+
+def test_what_is_not_ready_in_time_is_left_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(beside, "_READY_S", 0.0)
+    with running_beside(tmp_path, tmp_path, 0, RealtimeSettings(), 50.0, 5) as begin_at:
+        begin_at(time.monotonic_ns())
+    assert read_bare_loop(tmp_path, tmp_path, 50.0) is None
+    assert read_round_trips(tmp_path, 50.0) is None
 
 
 @pytest.mark.parametrize(

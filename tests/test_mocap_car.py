@@ -112,29 +112,29 @@ def _off_m(track: Track, x: Floats) -> float:
 
 
 def test_a_car_that_is_only_seen_laps_and_stands_when_the_run_is_over(tmp_path: Path) -> None:
-    """Of three drives one: a busy machine misses cycles, and the car a bend."""
-    for attempt in "123":
-        with _benched(tmp_path / attempt) as bench:
+    """Drives up to three times: a busy machine misses cycles, and then the car may miss a bend."""
+    for attempt in range(3):
+        with _benched(tmp_path / str(attempt)) as bench:
             bench.begin()
             done = finish(bench.drive("--laps", "2", "--max-time", "30"))
-            if done.returncode == 0:
-                _is_two_laps_and_a_stop(bench)
+            cycles = LogColumns(bench.log, {TELEMETRY: "estimate fallback"}).read()[TELEMETRY]
+            solved = np.mean(cycles["fallback"] == 0)
+            if done.returncode == 0 or solved > 0.995:
+                assert done.returncode == 0, done.stdout + done.stderr
+                assert solved > 0.95
                 assert "passed: 2 laps" in done.stdout
+                _is_seen_and_stands(bench)
                 return
-        assert "samples off the track" in done.stdout, done.stdout + done.stderr
-        assert "shifted plan" in done.stdout
-    pytest.fail(done.stdout)
+    pytest.fail(f"the machine has missed cycles in every drive: {done.stdout}")
 
 
-def _is_two_laps_and_a_stop(bench: Bench) -> None:
+def _is_seen_and_stands(bench: Bench) -> None:
     x, track = bench.true_states(), prepared().first.track
     assert _off_m(track, x) <= 0
     assert abs(x[-1, 4]) < 0.02
     reader = LogReader(bench.log)
     assert not reader.select(TRUTH)
     assert all(state.estimated for state in reader.select(STATE))
-    cycles = LogColumns(bench.log, {TELEMETRY: "estimate fallback"}).read()[TELEMETRY]
-    assert np.mean(cycles["fallback"] == 0) > 0.95
     said = bench.status()
     assert "pose 99 Hz" in said or "pose 9" in said or "pose 10" in said
 

@@ -3,6 +3,7 @@ what is learned from them."""
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -19,9 +20,9 @@ from bayesrace.gp.weights import Weights
 from bayesrace.integrators import PREDICTION
 from bayesrace.learning import smoothing
 from bayesrace.learning.dataset import Dataset, concatenate
-from bayesrace.learning.drives import Drive
+from bayesrace.learning.drives import Drive, Event, Measured
 from bayesrace.learning.gaussian_process import PairDistances, likelihood
-from bayesrace.learning.kalman import Smoothed
+from bayesrace.learning.kalman import Smoothed, backward, forward
 from bayesrace.learning.settings import TrainingSettings
 from bayesrace.learning.smoothing import smooth
 from bayesrace.learning.sources import (
@@ -154,6 +155,29 @@ def test_it_is_what_all_readings_at_once_say(
         if k:
             unit = np.outer(scale[k], scale[k - 1])
             assert np.abs((found.cross[k - 1] - blocks[i, :, ends[k - 1]]) / unit).max() < 1e-3
+
+
+def test_covariances_stay_symmetric_where_the_model_is_unstable() -> None:
+    """Rounding would grow with the model, and be taken for a covariance."""
+    m, count = 9, 1500
+    f = np.eye(m)
+    f[0, 3] = f[1, 4] = f[2, 5] = 0.01
+    f[4, 4], f[4, 5] = 1.036, 0.1
+    random = np.random.default_rng(1)
+    pose = partial(Measured, states=(0, 1, 2), variance=np.full(3, 1e-6), instrument="camera")
+    events = [
+        Event(0.01, k, np.zeros(2), pose(time_s=0.01 * k, value=random.normal(0, 1e-3, 3)))
+        for k in range(count)
+    ]
+
+    def go(_: int, x: Floats) -> tuple[Floats, Floats, Floats]:
+        return x @ f.T, f, 1e-6 * np.eye(m)
+
+    found = forward(events, np.zeros((1, m)), np.eye(m)[None], go, gate=0)
+    p = found.p[-1, 0]
+    scale = np.sqrt(np.diag(p))
+    assert np.abs((p - p.T) / np.outer(scale, scale)).max() < 1e-12
+    assert np.isfinite(backward(events, found).x).all()
 
 
 @pytest.mark.filterwarnings("error")

@@ -16,7 +16,6 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -35,88 +34,82 @@ __all__ = ["bare_loop", "bare_result", "read_bare_loop", "read_round_trips", "ru
 
 _LOOP: Final = "bare_loop"
 _MESSAGES: Final = "round_trip"
-"""Names of the files: ``.npy`` with the numbers, ``.log`` with the output."""
+"""What the processes do, and names of their files: ``.npy`` with numbers, ``.log`` with output."""
 _BEGIN: Final = "begin.npy"
-"""When the periods begin [ns], 0 until that is known; whether loop and messages are ready."""
+"""When the periods begin [ns], 0 until that is known; then 1 for each of these that is ready."""
+_READY: Final = {_LOOP: 1, _MESSAGES: 2}
 
 _BYTES: Final = bytes(120)
 _LOOK_S: Final = 0.01
 _READY_S: Final = 30.0
-"""A busy machine takes long to start them; what is not ready by then begins late."""
+"""A busy machine takes long to start them; what is not ready by then is left out."""
 
 
 @contextmanager
 def running_beside(
-    out: Path, load: int, realtime: RealtimeSettings, rate_hz: float, count: int
+    out: Path, numbers: Path, load: int, realtime: RealtimeSettings, rate_hz: float, count: int
 ) -> Iterator[Callable[[int], None]]:
-    """A bare loop and bare messages, ``count`` periods of both, and ``load`` busy processes for the
-    block; at its end the numbers are in the folder ``out``.
+    """Starts a bare loop and bare messages, ``count`` periods of both, and ``load`` busy processes,
+    and waits until they are ready; they end with the block.
 
-    The block begins when they are ready, and calls what it is given with the time at which the
-    periods begin [ns].
+    The block gets a function, to be called with the time [ns] at which the periods begin. At its
+    end what was measured is in the folder ``numbers``; ``out`` is for the output of the processes.
     """
-    np.save(out / f"{_MESSAGES}.npy", np.zeros(count, dtype=np.int64))
-    begin_path = str(out / _BEGIN)
-    np.save(begin_path, np.zeros(3, dtype=np.int64))
-    begin = np.lib.format.open_memmap(begin_path, mode="r+")
+    np.save(numbers / f"{_MESSAGES}.npy", np.zeros(count, dtype=np.int64))
+    np.save(numbers / _BEGIN, np.zeros(3, dtype=np.int64))
+    begin = np.lib.format.open_memmap(str(numbers / _BEGIN), mode="r+")
     with ExitStack() as stack:
-        stack.callback(os.unlink, begin_path)
         (endpoint,) = stack.enter_context(private_endpoints("answers"))
 
-        def start(name: str, work: str, **task: Any) -> Child:
-            task |= {"realtime": realtime.model_dump(), "work": work}
+        def start(work: str, **task: Any) -> Child:
+            task |= {"work": work, "realtime": realtime.model_dump()}
             line = ["--parent-pid", str(os.getpid()), json.dumps(task)]
             module = "bayesrace.studies.latency.beside"
-            return stack.enter_context(child(line, out / f"{name}.log", module))
+            return stack.enter_context(child(line, out / f"{work}.log", module))
 
-        period = {"begin_path": begin_path, "period_ns": round(1e9 / rate_hz)}
-        path = str(out / f"{_LOOP}.npy")
-        bare = start(_LOOP, "loop", path=path, count=count, **period)
-        answer = start("answer", "answer", endpoint=endpoint)
-        path = str(out / f"{_MESSAGES}.npy")
-        messages = start(_MESSAGES, "send", endpoint=endpoint, path=path, **period)
+        measured = {"numbers": str(numbers), "period_ns": round(1e9 / rate_hz)}
+        timed = {_LOOP: start(_LOOP, count=count, **measured)}
+        answer = start("answer", endpoint=endpoint)
+        timed[_MESSAGES] = start(_MESSAGES, endpoint=endpoint, **measured)
         for _ in range(load):
-            start("load", "load")
+            start("load")
         deadline = time.monotonic() + _READY_S
         while not begin[1:].all() and time.monotonic() < deadline:
-            if any(one.ended() for one in (bare, answer, messages)):
+            if any(one.ended() for one in (*timed.values(), answer)):
                 break
             time.sleep(_LOOK_S)
-        yield partial(begin.__setitem__, 0)
-        bare.wait(1.0)
+        for work, one in timed.items():
+            if not begin[_READY[work]]:
+                one.stop()
+
+        def begin_at(time_ns: int) -> None:
+            begin[0] = time_ns
+
+        yield begin_at
+        timed[_LOOP].wait(1.0)
 
 
-def _begin_ns(path: str, place: int) -> int:
-    """When the periods begin, waited for by a process that is ready."""
-    begin = np.lib.format.open_memmap(path, mode="r+")
-    begin[place] = 1
+def _begin_ns(work: str, numbers: str) -> int:
+    """When the periods begin, for which a process that is ready waits."""
+    begin = np.lib.format.open_memmap(f"{numbers}/{_BEGIN}", mode="r+")
+    begin[_READY[work]] = 1
     while not begin[0]:
         time.sleep(_LOOK_S)
     return int(begin[0])
 
 
-def _read(path: Path) -> NDArray[np.int64]:
-    """The numbers in a file, which is removed; empty if there is none."""
-    try:
-        found: NDArray[np.int64] = np.load(path)
-        path.unlink()
-    except (OSError, ValueError):
-        return np.empty(0, dtype=np.int64)
-    return found
-
-
-def read_bare_loop(out: Path, rate_hz: float) -> tuple[Series, BareLoop] | None:
+def read_bare_loop(out: Path, numbers: Path, rate_hz: float) -> tuple[Series, BareLoop] | None:
     """Wake-up errors by time, and the numbers of the report; None if the loop never woke."""
-    late_ns = _read(out / f"{_LOOP}.npy")
-    if not len(late_ns):
+    path = numbers / f"{_LOOP}.npy"
+    if not path.exists() or not len(late_ns := np.load(path)):
         return None
     refused = (out / f"{_LOOP}.log").read_text(errors="replace").splitlines()
     return bare_result(late_ns, round(1e9 / rate_hz), refused)
 
 
-def read_round_trips(out: Path, rate_hz: float) -> Series | None:
+def read_round_trips(numbers: Path, rate_hz: float) -> Series | None:
     """Round trips by time; None if no message came back."""
-    taken_ns = _read(out / f"{_MESSAGES}.npy")
+    taken_ns = np.load(numbers / f"{_MESSAGES}.npy")
     (back,) = np.nonzero(taken_ns)
     return Series(back / rate_hz, taken_ns[back].astype(np.float64)) if len(back) else None
 
@@ -162,15 +155,16 @@ def bare_loop(
     return late_ns[:woken]
 
 
-def _loop(path: str, begin_path: str, period_ns: int, count: int) -> None:
+def _loop(numbers: str, period_ns: int, count: int) -> None:
     """The bare loop as a process; SIGTERM ends it early, and it keeps what it has measured."""
-    begin_ns, signals = _begin_ns(begin_path, 1), list[int]()
+    begin_ns, signals = _begin_ns(_LOOP, numbers), list[int]()
     signal.signal(signal.SIGTERM, lambda number, _frame: signals.append(number))
-    np.save(path, bare_loop(count, period_ns, begin_ns, lambda: bool(signals)))
+    late_ns = bare_loop(count, period_ns, begin_ns, lambda: bool(signals))
+    np.save(f"{numbers}/{_LOOP}.npy", late_ns)
 
 
 def _answer(endpoint: str) -> None:
-    """Sends back what comes, until it is ended; it listens once its answers are listened to."""
+    """Sends back what comes, until it is ended; subscribes when the sender can hear the answers."""
     with open_session(Endpoints(listen=(endpoint,))) as session:
         back = session.declare_publisher("back", express=True)
         _wait_for_listener(back)
@@ -179,16 +173,15 @@ def _answer(endpoint: str) -> None:
             back.put(there.recv().payload)
 
 
-def _send(endpoint: str, path: str, begin_path: str, period_ns: int) -> None:
+def _send(endpoint: str, numbers: str, period_ns: int) -> None:
     """One message each period; the file has what came back, however this process ends."""
-    taken_ns = np.lib.format.open_memmap(path, mode="r+")
+    taken_ns = np.lib.format.open_memmap(f"{numbers}/{_MESSAGES}.npy", mode="r+")
     with open_session(Endpoints(connect=(endpoint,)), peers_follow=True) as session:
         back = session.declare_subscriber("back", zenoh.handlers.FifoChannel(100))
         there = session.declare_publisher("there", express=True)
         _wait_for_listener(there)
-        begin_ns = _begin_ns(begin_path, 2) + period_ns // 2
-        first = max(0, -(-(time.monotonic_ns() - begin_ns) // period_ns))
-        for k in range(first, len(taken_ns)):
+        begin_ns = _begin_ns(_MESSAGES, numbers) + period_ns // 2
+        for k in range(len(taken_ns)):
             sleep_until_ns(begin_ns + k * period_ns)
             sent_ns = time.monotonic_ns()
             there.put(_BYTES)
@@ -206,8 +199,8 @@ def _run(work: str, realtime: Any, **task: Any) -> None:
         pass
     # What is refused the bare loop says for all.
     refused = prepare_thread(RealtimeSettings(**realtime))
-    sys.stdout.writelines(f"{one}\n" for one in refused if work == "loop")
-    works: dict[str, Callable[..., None]] = {"loop": _loop, "answer": _answer, "send": _send}
+    sys.stdout.writelines(f"{one}\n" for one in refused if work == _LOOP)
+    works: dict[str, Callable[..., None]] = {_LOOP: _loop, "answer": _answer, _MESSAGES: _send}
     works[work](**task)
 
 

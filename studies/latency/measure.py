@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Final
 
 from bayesrace.errors import InputError
@@ -122,6 +123,24 @@ def _record(
     run: Run, settings: LatencySettings, track: Track | None, out: Path, stages: Stages
 ) -> None:
     """Records the run, and the machine beside it."""
+    with TemporaryDirectory(prefix="bayesrace-") as folder:
+        rate_hz = _drive(run, settings, track, out, Path(folder), stages)
+        run.bare = read_bare_loop(out, Path(folder), rate_hz)
+        run.round_trip = read_round_trips(Path(folder), rate_hz)
+    run.host = socket.gethostname()
+    run.notes += [] if run.bare else ["no bare loop to compare the misses with: it was lost"]
+    run.notes += [] if run.round_trip else ["no bare round trip of messages: it was lost"]
+
+
+def _drive(
+    run: Run,
+    settings: LatencySettings,
+    track: Track | None,
+    out: Path,
+    beside: Path,
+    stages: Stages,
+) -> float:
+    """The rate of what has driven; ``beside`` has what was measured beside it."""
     files = None
     if settings.attach is None:
         files = prepare(
@@ -146,24 +165,23 @@ def _record(
                 with stages.stage(f"wait for a run, {_RUN_S:g} s at most"):
                     _wait_for_run(director, run.car)
             rate_hz = director.status("controller").rate_hz
+            count = round(settings.duration_s * rate_hz)
+            # Before anything is recorded: it takes seconds to start.
+            begin_at = stack.enter_context(
+                running_beside(out, beside, settings.load, settings.realtime, rate_hz, count)
+            )
             about = {"latency": {"settings": settings.model_dump_json()}}
             recorder = stack.enter_context(Recorder(session, run.car, out / _LOG, about))
-            count = round(settings.duration_s * rate_hz)
-            begin = stack.enter_context(
-                running_beside(out, settings.load, settings.realtime, rate_hz, count)
-            )
             if track is not None and settings.attach is None:
                 limit_s = settings.warm_up_s + settings.duration_s + _AFTERWARDS_S
                 plan = RunPlan(1, "bayesrace", 0, limit_s, lockstep=False)
                 director.start(run_request(track, plan))
                 stack.callback(_stop, director)
-        begin(begin_ns := time.monotonic_ns() + round(settings.warm_up_s * 1e9))
+        begin_ns = time.monotonic_ns() + round(settings.warm_up_s * 1e9)
+        begin_at(begin_ns)
         with stages.stage(f"record {settings.duration_s:g} s"):
             run.watch(director, recorder, begin_ns, begin_ns + round(settings.duration_s * 1e9))
-    run.host, run.bare = socket.gethostname(), read_bare_loop(out, rate_hz)
-    run.round_trip = read_round_trips(out, rate_hz)
-    run.notes += [] if run.bare else ["no bare loop to compare the misses with: it was lost"]
-    run.notes += [] if run.round_trip else ["no bare round trip of messages: it was lost"]
+    return rate_hz
 
 
 def _wait_for_run(director: Director, car: str) -> None:
