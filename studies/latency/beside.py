@@ -100,8 +100,11 @@ def _begin_ns(work: str, numbers: str) -> int:
 
 def read_bare_loop(out: Path, numbers: Path, rate_hz: float) -> tuple[Series, BareLoop] | None:
     """Wake-up errors by time, and the numbers of the report; None if the loop never woke."""
-    path = numbers / f"{_LOOP}.npy"
-    if not path.exists() or not len(late_ns := np.load(path)):
+    try:
+        late_ns = np.load(numbers / f"{_LOOP}.npy")
+    except (OSError, ValueError):  # it was lost before it has written, or while it did
+        return None
+    if not len(late_ns):
         return None
     refused = (out / f"{_LOOP}.log").read_text(errors="replace").splitlines()
     return bare_result(late_ns, round(1e9 / rate_hz), refused)
