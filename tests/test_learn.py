@@ -90,14 +90,14 @@ def test_weights_change_within_the_lap(tmp_path: Path, course: Course) -> None:
     """After some seconds of driving, in place of the end of a lap; none is sent after the last."""
     out = tmp_path / "job"
     with rigged(tmp_path, course) as rig:
-        job = learning(rig, out, "--every", "2", "--laps", "4", "--weights", course.weights_file)
+        job = learning(rig, out, "--every", "2", "--laps", "8", "--weights", course.weights_file)
         with job as learner:
-            rig.drive(4, lockstep=False)
+            rig.drive(8, lockstep=False)
             assert learner.process.wait(PATIENCE_S) == 0, learner.said()
             last = rig.version()
     content = record(out)
     laps, updates = content["laps"], content["updates"]
-    assert [lap["lap"] for lap in laps] == [1, 2, 3, 4]
+    assert [lap["lap"] for lap in laps] == list(range(1, 9))
     learned = [one for one in updates if one["samples"]]
     assert len([one for one in learned if one["after_lap"] == 0]) >= 1
     assert len(learned) >= 2

@@ -5,13 +5,14 @@ at once: in a position, an epoch, a run number.
 """
 
 import time
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 
 import pytest
 
+from bayesrace.errors import InputError
 from bayesrace.messages import Status
-from bayesrace.transport import free_endpoint
+from bayesrace.transport import Director, free_endpoint
 from tests.network.cars import (
     Course,
     Program,
@@ -26,6 +27,14 @@ pytestmark = [pytest.mark.check, pytest.mark.wall_clock, pytest.mark.unmeasured]
 
 CARS = ("red", "green", "blue", "white")
 APART_M = 10.0
+
+
+def told(director: Director, whom: str) -> Status:
+    """With four cars a busy machine may answer late: then it is asked again."""
+    for _ in range(5):
+        with suppress(InputError):
+            return director.status(whom)
+    return director.status(whom)
 
 
 def assert_own(journey: Journey, course: Course, run: int, status: Status) -> None:
@@ -75,7 +84,7 @@ def test_four_cars_drive_at_once(tmp_path: Path) -> None:
             drive_on(observer)
         together_s = time.monotonic() - all_driving_s
         status = {
-            name: (one.director.status("plant"), one.director.status("controller"))
+            name: (told(one.director, "plant"), told(one.director, "controller"))
             for name, one in observers.items()
         }
         for observer in observers.values():
