@@ -119,8 +119,10 @@ def test_a_start_is_where_its_kind_says(rig: Rig, circuit: Circuit, car: Car) ->
 def test_instructions_are_counted_the_same_each_time_and_grow_with_the_work(
     rig: Rig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A launch takes more to answer than a step soon after it; half the points take fewer. Counts of
-    a launch once differed by 6e-5, those of no other cycle ever."""
+    """A launch takes more to answer than a step soon after it; half the points take fewer.
+
+    Counts of a launch have differed by 6e-5 once.
+    """
     estimate, feedback, prepare = rig.count_recorded(4).T
     assert rig.count_recorded(4)[:, 1] == pytest.approx(feedback, rel=2e-4)
     assert feedback[0] > 2 * feedback[3] > 20 * estimate[3] > 0
