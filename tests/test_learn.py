@@ -88,16 +88,20 @@ def test_laps_in_lockstep_get_faster_and_stay_on_the_track(tmp_path: Path, cours
 @pytest.mark.check
 def test_weights_change_within_the_lap(tmp_path: Path, course: Course) -> None:
     """After some seconds of driving, in place of the end of a lap; none is sent after the last."""
-    out = tmp_path / "job"
-    with rigged(tmp_path, course) as rig:
-        job = learning(rig, out, "--every", "2", "--laps", "8", "--weights", course.weights_file)
-        with job as learner:
-            rig.drive(8, lockstep=False)
-            assert learner.process.wait(PATIENCE_S) == 0, learner.said()
-            last = rig.version()
-    content = record(out)
-    laps, updates = content["laps"], content["updates"]
-    assert [lap["lap"] for lap in laps] == list(range(1, 9))
+    for count in (4, 20):  # on a busy machine learning takes longer than four laps
+        out = tmp_path / str(count)
+        out.mkdir()
+        with rigged(out, course) as rig:
+            every = ("--every", "2", "--laps", str(count), "--weights", course.weights_file)
+            with learning(rig, out / "job", *every) as learner:
+                rig.drive(count, lockstep=False)
+                assert learner.process.wait(PATIENCE_S) == 0, learner.said()
+                last = rig.version()
+        content = record(out / "job")
+        laps, updates = content["laps"], content["updates"]
+        if any(len(lap["versions"]) > 1 for lap in laps):
+            break
+    assert [lap["lap"] for lap in laps] == list(range(1, count + 1))
     learned = [one for one in updates if one["samples"]]
     assert len([one for one in learned if one["after_lap"] == 0]) >= 1
     assert len(learned) >= 2
