@@ -37,7 +37,8 @@ from bayesrace.gp.expression import kernel_matrix
 from bayesrace.gp.weights import FEATURES, GpOutput, Weights
 from bayesrace.integrators import Discretisation
 from bayesrace.learning.dataset import MIRRORED_FEATURES, MIRRORED_OUTPUTS, Dataset
-from bayesrace.learning.drives import HEADING, OFFSETS, Drive, Estimates, Event, Measured
+from bayesrace.learning.drives import Drive, Estimates, Event, Measured
+from bayesrace.learning.kalman import compared
 from bayesrace.learning.smoothing import (
     blurred,
     corrected_steps,
@@ -225,7 +226,8 @@ class _Belief:
         self._bases, count = bases, int(ends[-1])
         self._noise = noise_share * np.array([one.before.amplitudes[3] for one in bases])
         self._w, self._ww = np.zeros(count), np.eye(count)
-        self._x, self._xx, self._xw = np.zeros(_NB), np.zeros((_NB, _NB)), np.zeros((_NB, count))
+        self._x, self._rows = np.zeros(_NB), np.zeros((_NB, _NB + count))
+        self._xx, self._xw = self._rows[:, :_NB], self._rows[:, _NB:]
         self._later, self._count = np.zeros((_LATER + _NX, count)), 0
         """The first rows R, of which R' R is still to be taken from the covariance of w."""
 
@@ -264,7 +266,7 @@ class _Belief:
             raise ValueError("the drive has not been smoothed")
         path = path[:, :_NB]
         chain = self._chain(events, path, samples, car, discretisation, weights)
-        self._x, self._xx = started(events[0], drive, car, path[0])
+        self._x, self._xx[:] = started(events[0], drive, car, path[0])
         self._xw[:] = 0
         for i, event in enumerate(chain.read):
             if event.duration_s > 0:
@@ -316,30 +318,23 @@ class _Belief:
         gg = np.array([gw[:, part] @ one for one, part in pairs])
         across = slope @ gx.T @ by_g.T
         self._x += by_g @ (g - chain.assumed[i])
-        self._xx = slope @ self._xx @ slope.T + across + across.T + by_g @ gg @ by_g.T
-        self._xx = (self._xx + self._xx.T) / 2 + chain.noise[i]
-        self._xw = slope @ self._xw + by_g @ gw
+        xx = slope @ self._xx @ slope.T + across + across.T + by_g @ gg @ by_g.T
+        self._xx[:] = (xx + xx.T) / 2 + chain.noise[i]
+        self._xw[:] = slope @ self._xw + by_g @ gw
 
     def _update(self, measured: Measured) -> None:
         """By a reading, one number after the other."""
         numbers = zip(measured.states, measured.value, measured.variance, strict=True)
         for state, value, variance in numbers:
-            by_x, by_w, new = self._xx[state], self._xw[state], value - self._x[state]
-            s = by_x[state] + variance
-            if (offset := OFFSETS.get(state)) is not None:
-                by_x, by_w = by_x + self._xx[offset], by_w + self._xw[offset]
-                s, new = by_x[state] + by_x[offset] + variance, new - self._x[offset]
-            if state == HEADING:
-                new = np.remainder(new + np.pi, 2 * np.pi) - np.pi
+            new, hp, s = compared(state, value, variance, self._x, self._rows)
             if not s > 0:
                 raise np.linalg.LinAlgError("the readings cannot be followed")
             deviation = np.sqrt(s)
-            by_x, by_w, white = by_x / deviation, by_w / deviation, new / deviation
-            self._x += by_x * white
-            self._w += by_w * white
-            self._xx -= np.outer(by_x, by_x)
-            self._xw -= np.outer(by_x, by_w)
-            self._later[self._count] = by_w
+            by, white = hp / deviation, new / deviation
+            self._x += by[:_NB] * white
+            self._w += by[_NB:] * white
+            self._rows -= np.outer(by[:_NB], by)
+            self._later[self._count] = by[_NB:]
             self._count += 1
         if self._count >= _LATER:
             self._settle()

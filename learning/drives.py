@@ -13,13 +13,10 @@ from numpy.typing import NDArray
 from bayesrace.arrays import Flags, Floats, Rows
 from bayesrace.messages import QUANTITIES, Reading
 
-__all__ = ["HEADING", "OFFSETS", "POSE", "Drive", "Estimates", "Event", "Measured"]
+__all__ = ["POSE", "Drive", "Estimates", "Event", "Measured"]
 
 POSE: Final = (0, 1, 2)
 """Numbers of the states that are position and heading."""
-HEADING: Final = 2
-OFFSETS: Final = {5: 7, 6: 8}
-"""The number of the offset that a yaw rate and a steering angle are read with."""
 _SAME_S: Final = 1e-9
 _LEAST: Final = 10
 """Readings that a drive needs."""

@@ -11,20 +11,23 @@ With the gain
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from scipy.special import chdtri
 
 from bayesrace.arrays import Flags, Floats, Rows
-from bayesrace.learning.drives import HEADING, OFFSETS, Event, Measured
+from bayesrace.learning.drives import Event, Measured
 
-__all__ = ["Filtered", "Smoothed", "Transition", "backward", "forward"]
+__all__ = ["Filtered", "Smoothed", "Transition", "backward", "compared", "forward"]
 
 _NX: Final = 7
 _NB: Final = 9
 _EXCEEDED: Final = {n: float(chdtri(n, 0.001)) for n in range(1, _NX + 1)}
 """Squared distances that one of 1,000 right readings exceeds, as in the C code."""
+_OFFSETS: Final = {5: 7, 6: 8}
+"""The number of the offset that a yaw rate and a steering angle are read with."""
+_HEADING: Final = 2
 _REFUSED: Final = 5
 """After so many refused readings of an instrument in a row the next one is taken in: the filter is
 wrong then, not the instrument."""
@@ -121,13 +124,7 @@ def _updated(
     given, squared, log_s = (x, p), np.zeros(len(x)), np.zeros(len(x))
     numbers = zip(measured.states, measured.value.tolist(), measured.variance.tolist(), strict=True)
     for state, value, variance in numbers:
-        hp, new = p[:, state], value - x[:, state]
-        s = hp[:, state] + variance
-        if (offset := OFFSETS.get(state)) is not None:
-            hp, new = hp + p[:, offset], new - x[:, offset]
-            s = hp[:, state] + hp[:, offset] + variance
-        if state == HEADING:
-            new = np.remainder(new + np.pi, 2 * np.pi) - np.pi
+        new, hp, s = compared(state, value, variance, x, p)
         deviation = np.sqrt(s)[:, None]
         by = hp / deviation
         x, p = x + by * (new[:, None] / deviation), p - by[:, :, None] * by[:, None]
@@ -144,6 +141,19 @@ def _updated(
     if not passed.all():
         x, p = np.where(passed[:, None], x, given[0]), np.where(passed[:, None, None], p, given[1])
     return x, p, passed
+
+
+def compared(state: int, value: float, variance: float, x: Floats, p: Floats) -> Any:
+    """Of a number that was read of ``state``: what it differs by from what it would be at ``x``
+    (.., m), the covariance of that with all rows of ``p`` (.., m, n), (.., n), and its variance."""
+    new, hp = value - x[..., state], p[..., state, :]
+    s = hp[..., state] + variance
+    if (offset := _OFFSETS.get(state)) is not None:
+        new, hp = new - x[..., offset], hp + p[..., offset, :]
+        s = hp[..., state] + hp[..., offset] + variance
+    if state == _HEADING:
+        new = np.remainder(new + np.pi, 2 * np.pi) - np.pi
+    return new, hp, s
 
 
 def backward(events: Sequence[Event], filtered: Filtered) -> Smoothed:

@@ -21,7 +21,7 @@ Steering that no instrument reads is what was commanded, from what is known of i
 run's the wheels are straight, later the controller's estimate is as good as it states.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import product
 from typing import Any, Final, NamedTuple
@@ -290,30 +290,26 @@ def _walked(events: Sequence[Event], drive: Drive, car: Car) -> Smoothed:
     p0[0, _NB:, _NB:] = np.diag(full**2)
     gate, density = car.tuning.estimator.gate, full[None] ** 2 / _JERK_S
     path = backward(events, forward(events, x0, p0, _stepwise(events, density), gate)).path
-    windows = _windows(events)
+    along, windows = _along(events, path), _windows(events)
     for factor, count in ((10.0, 5), (3.0, 3), (1.7, 3)):
         steps = factor ** np.arange(-(count // 2), count // 2 + 1)
         grid = np.array(list(product(steps, repeat=3 if count == 3 else 2)))
         tried = density * (grid if count == 3 else grid[:, [0, 0, 1]])
         p, found = np.tile(p0, (len(tried), 1, 1)), np.zeros(len(tried))
         for first, last in windows:
-            part, x = events[first:last], path[first] if first else x0[0]
-            go = _along(part, path[first:last], tried)
-            found += forward(part, np.tile(x, (len(tried), 1)), p, go, gate).likelihood
+            x = np.tile(path[first] if first else x0[0], (len(tried), 1))
+            found += forward(events[first:last], x, p, along(tried, first), gate).likelihood
         density = tried[[int(np.argmax(np.nan_to_num(found, nan=-np.inf)))]]
-    loose = _along(events, path, _LOOSER * density)
-    refused = forward(events, x0, p0, loose, gate).refused[:, 0]
+    refused = forward(events, x0, p0, along(_LOOSER * density), gate).refused[:, 0]
     kept = [one.without() if wrong else one for one, wrong in zip(events, refused, strict=True)]
-    smoothed = backward(kept, forward(kept, x0, p0, _along(kept, path, density), gate=0))
+    smoothed = backward(kept, forward(kept, x0, p0, along(density), gate=0))
     return replace(smoothed, refused=refused)
 
 
 def _windows(events: Sequence[Event]) -> list[tuple[int, int]]:
     """First event, a pose, and end of each window; the first one is where the drive begins."""
     count, periods = _SEARCHED
-    poses = [
-        i for i, one in enumerate(events[:-1]) if one.measured and one.measured.states[:3] == POSE
-    ]
+    poses = [i for i, one in enumerate(events) if one.measured and one.measured.states[:3] == POSE]
     passed = np.cumsum([one.period >= 0 for one in events])
     if passed[-1] <= count * periods:
         return [(0, len(events))]
@@ -322,17 +318,22 @@ def _windows(events: Sequence[Event]) -> list[tuple[int, int]]:
     return [(i, int(np.searchsorted(passed, passed[i] + periods, "right"))) for i in firsts]
 
 
-def _along(events: Sequence[Event], path: Floats, density: Floats) -> Transition:
-    """The random walk linearised along the path (e, 12), for densities (b, 3) of the jerk."""
+def _along(events: Sequence[Event], path: Floats) -> Callable[..., Transition]:
+    """The random walk linearised along the path (e, 12), of densities (b, 3) of the jerk, for the
+    events from a ``first`` one on."""
     before, (u, h), m = path[:-1], inputs_of(events[1:]), path.shape[1]
     after, f, jerk = _walk(len(before))(before, u, h[:, None])
     q = jerk.reshape(-1, 3, m * m)
 
-    def go(i: int, x: Floats) -> tuple[Floats, Floats, Floats]:
-        added = (density @ q[i - 1]).reshape(-1, m, m)
-        return after[i - 1, :, 0] + (x - before[i - 1]) @ f[i - 1].T, f[i - 1], added
+    def of(density: Floats, first: int = 0) -> Transition:
+        def go(i: int, x: Floats) -> tuple[Floats, Floats, Floats]:
+            k = first + i - 1
+            added = (density @ q[k]).reshape(-1, m, m)
+            return after[k, :, 0] + (x - before[k]) @ f[k].T, f[k], added
 
-    return go
+        return go
+
+    return of
 
 
 def _stepwise(events: Sequence[Event], density: Floats) -> Transition:

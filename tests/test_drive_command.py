@@ -192,6 +192,7 @@ def test_a_run_whose_director_is_gone_ends_by_itself_or_by_a_command(
         done = run("stop", "--run", "--endpoint", waiting.plant_at)
         if busy.returncode == 2 and done.returncode == 0:
             break
+    assert busy.returncode == 2
     assert "'bayesrace stop --run' ends it" in busy.stderr
     assert (done.returncode, "stops" in done.stdout) == (0, True), done.stderr
     until(lambda: words().startswith("idle"), "the end of the run")

@@ -29,12 +29,12 @@ CARS = ("red", "green", "blue", "white")
 APART_M = 10.0
 
 
-def told(director: Director, whom: str) -> Status:
-    """With four cars a busy machine may answer late: then it is asked again."""
+def status_of(process: str, director: Director) -> Status:
+    """Asks again where a process answers too late: four cars keep a machine busy."""
     for _ in range(5):
         with suppress(InputError):
-            return director.status(whom)
-    return director.status(whom)
+            return director.status(process)
+    return director.status(process)
 
 
 def assert_own(journey: Journey, course: Course, run: int, status: Status) -> None:
@@ -84,7 +84,7 @@ def test_four_cars_drive_at_once(tmp_path: Path) -> None:
             drive_on(observer)
         together_s = time.monotonic() - all_driving_s
         status = {
-            name: (told(one.director, "plant"), told(one.director, "controller"))
+            name: (status_of("plant", one.director), status_of("controller", one.director))
             for name, one in observers.items()
         }
         for observer in observers.values():

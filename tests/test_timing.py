@@ -124,7 +124,9 @@ def test_instructions_are_counted_the_same_each_time_and_grow_with_the_work(
     Counts of a launch have differed by 6e-5 once.
     """
     estimate, feedback, prepare = rig.count_recorded(4).T
-    assert rig.count_recorded(4)[:, 1] == pytest.approx(feedback, rel=2e-4)
+    again = rig.count_recorded(4)[:, 1]
+    assert again[0] == pytest.approx(feedback[0], rel=2e-4)
+    assert again[1:] == pytest.approx(feedback[1:], rel=1e-5)
     assert feedback[0] > 2 * feedback[3] > 20 * estimate[3] > 0
     first, second, third = (
         replace(one, inputs=one.inputs[::2], alpha=one.alpha[::2]) for one in rig._weights.outputs

@@ -27,7 +27,7 @@ __all__ = ["page"]  # a fixture
 ROUNDED = 0.51e-5
 
 
-def told(source: Source) -> list[tuple[Floats, Floats]]:
+def errors_in(source: Source) -> list[tuple[Floats, Floats]]:
     """Error and band of each run that has been read, nan where there is none."""
     return [
         (np.array(run["rows"]["omega_error"], float), np.array(run["rows"]["omega_band"], float))
@@ -36,7 +36,7 @@ def told(source: Source) -> list[tuple[Floats, Floats]]:
 
 
 def read(path: Path, car: str = "") -> list[tuple[Floats, Floats]]:
-    return told(shown(path, car))
+    return errors_in(shown(path, car))
 
 
 def test_they_are_those_of_the_weights_that_drove(peanut_race: Race) -> None:
@@ -80,7 +80,7 @@ def test_they_come_with_the_weights_while_it_is_driven(peanut_race: Race, tmp_pa
             live.runs.take(piece)
             piece.clear()
     live.runs.take(piece, whole=True)
-    for own, other in zip(told(live), expected, strict=True):
+    for own, other in zip(errors_in(live), expected, strict=True):
         np.testing.assert_allclose(own, other, atol=2 * ROUNDED)
 
 

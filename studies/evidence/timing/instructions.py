@@ -1,7 +1,8 @@
 """Instructions of each phase of a cycle, counted by valgrind while a C program answers.
 
-The count is the same each time to one in a million, and on any processor of the kind: of user code,
-with the instruction sets that valgrind knows (AVX2, where the processor has AVX-512).
+The count is the same each time to one in a million (a launch's has differed by 6e-5, once), and on
+any processor of the kind: of user code, with the instruction sets that valgrind knows (AVX2, where
+the processor has AVX-512).
 """
 
 import itertools
