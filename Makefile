@@ -31,9 +31,10 @@ help:
 	@echo "make race    set up, and drive the whole comparison; leaves runs/DATE-TIME"
 	@echo "make paper   every figure and number of the paper on one page: runs/paper/paper.html"
 	@echo "make test    set up for testing, and run most tests, in a few minutes"
-	@echo "make check   everything: lint, docs, all tests, coverage; names the tools that it needs"
+	@echo "make check   everything: lint, docs, all tests; names the tools that it needs"
 	@echo "make lint    ruff, clang-format, mypy, import contracts"
 	@echo "make docs    the documentation as a site: build/site/index.html"
+	@echo "make coverage  lines and branches of Python and C that 'make test' executes"
 	@echo "make bench   time the compiled step beside CasADi + IPOPT"
 	@echo "make hashes  write constraints.hashed.txt, after a change of constraints.txt"
 	@echo "make release wheel, source, list of packages (SBOM) and checksums: build/release"
@@ -49,8 +50,9 @@ bench: $(VENV)/.ready
 	$(BIN)/bayesrace bench $(ARGS)
 
 # First the tests that compute, one a processor; then those with processes in real time, which mostly
-# wait. -m selects the tier and comes last. 5 means that ARGS selects no test of a part.
-# RUNNER: 'make check' measures coverage.
+# wait. One of the latter that fails beside others, whose work may have made it late, is run again,
+# alone, and that counts. -m selects the tier and comes last. 5 means that ARGS selects no test of a part.
+# RUNNER: 'make coverage' measures.
 RUNNER = $(BIN)/python -m
 TIER = not check
 # Pairs of processes in real time that run at once.
@@ -59,7 +61,9 @@ PYTEST = $(RUNNER) pytest --dist worksteal
 define RUN_TESTS
 	@$(PYTEST) --numprocesses auto --maxprocesses 8 $(ARGS) -m "($(TIER)) and not wall_clock"; \
 	computing=$$?; \
-	$(PYTEST) --numprocesses $(PAIRS) $(ARGS) -m "($(TIER)) and wall_clock"; meeting=$$?; $(TOOK); \
+	$(PYTEST) --numprocesses $(PAIRS) $(ARGS) -m "($(TIER)) and wall_clock"; meeting=$$?; \
+	[ $$meeting -ne 1 ] || { echo "Those that failed, again, alone:"; \
+		$(PYTEST) --last-failed --maxfail 1 $(ARGS) -m "($(TIER)) and wall_clock"; meeting=$$?; }; $(TOOK); \
 	for code in $$computing $$meeting; do [ $$code -eq 0 ] || [ $$code -eq 5 ] || exit $$code; done; \
 	[ $$computing -ne 5 ] || [ $$meeting -ne 5 ] || { echo "ARGS selects no test" >&2; exit 5; }
 endef
@@ -68,16 +72,14 @@ test: $(VENV)/.ready-test
 	$(RUN_TESTS)
 
 # What 'make test' runs, then the rest of the tests, which finds again what the former has driven.
-check: RUNNER = $(BIN)/coverage run -m
 check: export TEST_SESSION = $(CURDIR)/build/session
 check: tools $(VENV)/.ready-dev
-	@rm -rf build/coverage build/session
+	@rm -rf build/session
 	@$(MAKE) --no-print-directory lint
 	@$(MAKE) --no-print-directory docs
 	$(BIN)/python -m benchmarks.numbers check
-	@$(MAKE) --no-print-directory test RUNNER='$(RUNNER)'
-	@$(MAKE) --no-print-directory rest RUNNER='$(RUNNER)'
-	@$(MAKE) --no-print-directory coverage
+	@$(MAKE) --no-print-directory test
+	@$(MAKE) --no-print-directory rest
 	@$(TOOK)
 
 tools:
@@ -87,7 +89,12 @@ rest: TIER = check
 rest: $(VENV)/.ready-dev
 	$(RUN_TESTS)
 
+# Measuring makes Python two to three times slower, too slow for some tests in real time.
+coverage: RUNNER = $(BIN)/coverage run -m
+coverage: TIER = not check
 coverage: $(VENV)/.ready-dev
+	rm -rf build/coverage
+	$(RUN_TESTS)
 	find build/coverage -name 'data.*' -empty -delete # of processes that tests have killed
 	$(BIN)/coverage combine --quiet
 	$(BIN)/coverage report --skip-covered

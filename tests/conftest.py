@@ -9,7 +9,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Generator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -88,21 +88,6 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
         return None
     text = collection_path.read_text()
     return any(marker not in text for marker in wanted) or None
-
-
-@pytest.hookimpl(wrapper=True)
-def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object]:
-    """Processes of some long tests in the check tier are not measured for coverage.
-
-    Measuring makes Python two to three times slower, and what they execute the others do, too.
-    """
-    if not (item.get_closest_marker("unmeasured") and item.get_closest_marker("check")):
-        return (yield)
-    measuring = {name: os.environ.pop(name) for name in [*os.environ] if "COVERAGE_" in name}
-    try:
-        return (yield)
-    finally:
-        os.environ.update(measuring)
 
 
 def discrete(

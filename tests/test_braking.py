@@ -202,7 +202,6 @@ MOMENTS_S = (9.0, 10.7, 12.4)
 
 @pytest.mark.check
 @pytest.mark.wall_clock
-@pytest.mark.unmeasured
 @pytest.mark.parametrize(
     ("language", "what", "after_s"),
     [("Python", what, after_s) for what in LOSSES for after_s in MOMENTS_S]

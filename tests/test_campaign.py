@@ -21,7 +21,7 @@ from tests.command_line import Cli, refused
 from tests.programs import Race, campaign_scheduler, finish, peanut, run, start, until
 from tests.shared import session_folder
 
-pytestmark = [pytest.mark.check, pytest.mark.unmeasured]
+pytestmark = pytest.mark.check
 
 PLAN = """
 controllers = ["bayesrace"]

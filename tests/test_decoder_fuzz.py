@@ -31,8 +31,6 @@ from bayesrace.messages import (
 from tests.test_gp_weights import BODY, make_weights, reseal
 from tests.test_messages import KINDS, conforms, messages
 
-pytestmark = pytest.mark.unmeasured
-
 SCHEMAS = {kind: json_schema(kind) for kind in KINDS}
 
 

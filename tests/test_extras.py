@@ -82,7 +82,6 @@ def on_a_board(environment: Path) -> str:
 
 
 @pytest.mark.check
-@pytest.mark.unmeasured
 def test_the_controller_drives_with_its_own_extra_alone(
     release: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -177,7 +177,6 @@ def test_braking_by_the_fallback_is_braking_that_the_car_can_hold(
 
 
 @pytest.mark.check
-@pytest.mark.unmeasured
 def test_the_papers_comparison_on_its_own_small_track(tmp_path: Path) -> None:
     race = Race.running(tmp_path / "race", "--car", "f1tenth")()
     result = read_result(race.out / "result.json")

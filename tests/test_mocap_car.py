@@ -22,7 +22,7 @@ from tests.network.cars import free_port
 from tests.programs import ROOT, finish, run, start, until
 from tests.racing import prepared
 
-pytestmark = [pytest.mark.wall_clock, pytest.mark.check, pytest.mark.unmeasured]
+pytestmark = [pytest.mark.wall_clock, pytest.mark.check]
 
 FOLDER = ROOT / "examples" / "mocap_car"
 

@@ -210,7 +210,6 @@ def test_on_the_papers_line_our_laps_take_as_long_as_the_published_ones() -> Non
 
 
 @pytest.mark.check
-@pytest.mark.unmeasured
 def test_the_quick_page_is_whole(cli: Cli, circuit: Circuit, tmp_path: Path) -> None:
     for name in ("ethz", "ethzmobil"):
         peanut(tmp_path / f"{name}.csv")

@@ -35,8 +35,6 @@ from tests.programs import Race, leftovers
 from tests.reference import reference_file
 from tests.synthetic_race import Drive, analyse, circle, write_race
 
-pytestmark = pytest.mark.unmeasured
-
 CONTROLLERS = ["worstcase", "bayesrace", "bayesrace-updated", "bestcase"]
 LIMIT = "bayesrace-limit"
 

@@ -157,7 +157,6 @@ def test_a_killed_race_takes_its_processes_along(racing: Racing) -> None:
 
 
 @pytest.mark.check
-@pytest.mark.unmeasured  # an interrupt in the middle of measuring may never end
 def test_an_interrupt_before_the_first_lap(tmp_path: Path) -> None:
     process = begin(tmp_path)
     until(lambda: (tmp_path / "out" / "settings.json").exists(), "the race at work")

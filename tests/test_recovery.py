@@ -11,7 +11,7 @@ from tests.recovery import WITHIN_S, by_datagrams, by_network
 
 __all__ = ["racing_host"]  # a fixture
 
-pytestmark = [pytest.mark.check, pytest.mark.wall_clock, pytest.mark.unmeasured]
+pytestmark = [pytest.mark.check, pytest.mark.wall_clock]
 
 
 @pytest.mark.parametrize(

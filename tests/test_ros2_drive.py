@@ -22,7 +22,7 @@ from tests.programs import ROOT, finish, start, until
 from tests.racing import prepared
 from tests.ros_network import Ros
 
-pytestmark = [pytest.mark.wall_clock, pytest.mark.check, pytest.mark.unmeasured]
+pytestmark = [pytest.mark.wall_clock, pytest.mark.check]
 
 FOLDER = ROOT / "examples" / "ros2_car"
 

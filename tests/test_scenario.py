@@ -307,7 +307,6 @@ def test_every_scenario_that_ships_passes(name: str) -> None:
 
 @pytest.mark.check
 @pytest.mark.wall_clock
-@pytest.mark.unmeasured
 @pytest.mark.parametrize("name", [n for n in shipped() if n.startswith("realtime")])
 def test_every_scenario_in_real_time_passes(name: str) -> None:
     [one] = driven(read_scenario(name))

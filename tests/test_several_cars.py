@@ -23,7 +23,7 @@ from tests.network.cars import (
 )
 from tests.network.observer import Journey, drive_on, observing
 
-pytestmark = [pytest.mark.check, pytest.mark.wall_clock, pytest.mark.unmeasured]
+pytestmark = [pytest.mark.check, pytest.mark.wall_clock]
 
 CARS = ("red", "green", "blue", "white")
 APART_M = 10.0

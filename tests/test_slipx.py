@@ -127,7 +127,6 @@ def test_a_state_that_is_no_number_is_a_fault_and_the_last_good_one_stays() -> N
 
 
 @pytest.mark.check
-@pytest.mark.unmeasured
 def test_a_race_on_it_learns_what_the_kinematic_model_lacks(tmp_path: Path) -> None:
     """Over Zenoh in lockstep. There is no BestCase: WorstCase and the line are the measure."""
     how = ("--car", "slipx", "--simulator", "slipx", "--laps", "1")

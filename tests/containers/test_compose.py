@@ -213,7 +213,6 @@ def test_the_unit_allows_what_real_time_needs_and_refuses_the_rest() -> None:
 
 @systemd
 @pytest.mark.wall_clock
-@pytest.mark.unmeasured
 def test_a_lap_is_driven_with_the_system_calls_of_the_unit(
     tmp_path: Path, bundles: Bundles, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -26,7 +26,6 @@ from tests.programs import PATIENCE_S
 
 pytestmark = [
     pytest.mark.check,
-    pytest.mark.unmeasured,
     pytest.mark.timeout(1800),
     pytest.mark.skipif(missing_tools() != "", reason=missing_tools()),
 ]

@@ -32,7 +32,7 @@ from tests.network.cars import Course, Program, gentle_course, start_controller,
 from tests.network.observer import STANDING_MPS, Journey, Observer, drive_on, observing
 from tests.programs import PATIENCE_S, ROOT, run, until
 
-pytestmark = [pytest.mark.wall_clock, pytest.mark.unmeasured]
+pytestmark = pytest.mark.wall_clock
 
 BAD: Final = {"delay_s": 0.02, "jitter_s": 0.005, "loss": 0.05}
 

@@ -28,7 +28,7 @@ from tests.security.rig import course, secured
 
 __all__ = ["bundles", "course"]
 
-pytestmark = [pytest.mark.wall_clock, pytest.mark.unmeasured]
+pytestmark = pytest.mark.wall_clock
 
 LEASE_S = 5.0
 LOOK_S = 2.0

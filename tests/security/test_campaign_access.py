@@ -17,7 +17,7 @@ import pytest
 
 from tests.programs import campaign_scheduler, finish, start
 
-pytestmark = [pytest.mark.check, pytest.mark.unmeasured]
+pytestmark = pytest.mark.check
 
 
 def everywhere(client: Any) -> dict[str, str]:

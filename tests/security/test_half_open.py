@@ -30,7 +30,6 @@ __all__ = ["course"]
 pytestmark = [
     pytest.mark.check,
     pytest.mark.wall_clock,
-    pytest.mark.unmeasured,
     pytest.mark.skipif(os.geteuid() != 0, reason="needs root: network namespaces, rules"),
     pytest.mark.skipif(shutil.which("ip") is None, reason="needs ip, see .ci/tools"),
 ]

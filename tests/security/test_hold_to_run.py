@@ -29,7 +29,7 @@ from tests.security.rig import BOTH, attacking, course, secured
 
 __all__ = ["bundles", "course"]
 
-pytestmark = [pytest.mark.check, pytest.mark.wall_clock, pytest.mark.unmeasured]
+pytestmark = [pytest.mark.check, pytest.mark.wall_clock]
 
 NOTICED_S: Final = 0.5
 BRAKING_MPS2: Final = 1.0

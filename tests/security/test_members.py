@@ -23,7 +23,7 @@ from tests.security.rig import course, secured
 
 __all__ = ["course"]
 
-pytestmark = [pytest.mark.wall_clock, pytest.mark.unmeasured]
+pytestmark = pytest.mark.wall_clock
 
 BRIEF_S = 15.0
 CLOSED_S = 2.0

@@ -22,7 +22,7 @@ from tests.security.intruder import bare_session
 
 __all__ = ["bundles"]
 
-pytestmark = [pytest.mark.wall_clock, pytest.mark.unmeasured]
+pytestmark = pytest.mark.wall_clock
 
 MESSAGE_BYTES: Final = 200_000_000
 MOST_MB: Final = 60.0

@@ -37,7 +37,7 @@ from tests.security.rig import BOTH, Rig, attacking, course, secured
 
 __all__ = ["bundles", "course"]
 
-pytestmark = [pytest.mark.wall_clock, pytest.mark.unmeasured]
+pytestmark = pytest.mark.wall_clock
 
 
 @pytest.mark.parametrize(

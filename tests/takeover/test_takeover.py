@@ -30,7 +30,7 @@ from tests.programs import until
 from tests.takeover.rig import DRIVEN_S, Rig, digest, judges, rigged
 from tests.takeover.spoilt_weights import SPOILT, spoilt
 
-pytestmark = [pytest.mark.wall_clock, pytest.mark.unmeasured]
+pytestmark = pytest.mark.wall_clock
 
 CAR = get_car("orca")
 
