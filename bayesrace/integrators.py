@@ -8,8 +8,9 @@ integrators. :meth:`Discretisation.identity` names the combination; weights carr
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Final, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from bayesrace.strict import StrictModel
 from bayesrace.vehicles.parameters import Car
 
 if TYPE_CHECKING:
@@ -90,7 +91,7 @@ def _symbols(model: "Model") -> tuple[Any, Any, Any, Any]:
     return ca.SX.sym("x", n), ca.SX.sym("u", m), ca.SX.sym("e", 3), ca.SX.sym("h")
 
 
-class Discretisation(BaseModel):
+class Discretisation(StrictModel):
     """How a continuous-time model becomes x_{k+1} = F(x_k, u_k), input held over the step.
 
     ``pose``: "integrated" takes the pose from the scheme like every other state; "interpolated"
@@ -99,8 +100,6 @@ class Discretisation(BaseModel):
     that corrects the velocities alone leaves what they did to the pose during the step.
     docs/decisions/ has the measurement.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     scheme: Literal["euler", "heun", "rk4"] = Field("rk4", description="integration scheme")
     step_s: float = Field(0.02, gt=0, le=1, description="sampling time Ts")

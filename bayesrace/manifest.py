@@ -15,10 +15,11 @@ from functools import cache
 from pathlib import Path
 from typing import BinaryIO, Final
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import Field, ValidationError
 
 from bayesrace.errors import InputError, faults_in
 from bayesrace.files import read_whole
+from bayesrace.strict import StrictModel
 from bayesrace.trusted_files import trusted
 from bayesrace.vehicles.parameters import Car
 
@@ -45,10 +46,8 @@ _HEADERS: Final = tuple(
 )
 
 
-class ParameterInfo(BaseModel):
+class ParameterInfo(StrictModel):
     """One run-time parameter of a problem."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     name: str
     unit: str
@@ -58,10 +57,8 @@ class ParameterInfo(BaseModel):
     positive: bool = Field(description="has to be above zero")
 
 
-class ProblemInfo(BaseModel):
+class ProblemInfo(StrictModel):
     """The control problem, as far as its users need it; codegen/problems/ describes it."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     name: str
     states: list[str]
@@ -73,10 +70,8 @@ class ProblemInfo(BaseModel):
     follows_path: bool = Field(False, description="whether it drives a car along a line")
 
 
-class Manifest(BaseModel):
+class Manifest(StrictModel):
     """Identity of one built controller."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     abi: int = Field(description="version of the C interface")
     problem: ProblemInfo

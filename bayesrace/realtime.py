@@ -18,7 +18,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Final
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
+
+from bayesrace.strict import StrictModel
 
 __all__ = [
     "SUSPENDED_S", "RealtimeSettings", "prepare_thread", "short_slices", "suspension",
@@ -37,10 +39,8 @@ _SYSTEM_CALLS: Final = {"x86_64": (314, 315), "aarch64": (274, 275)}
 """Numbers of sched_setattr and sched_getattr, for which glibc before 2.41 has no functions."""
 
 
-class RealtimeSettings(BaseModel):
+class RealtimeSettings(StrictModel):
     """What to ask the system for; nothing by default but an exact timer."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     cpu: int | None = Field(None, ge=0, description="CPU to bind the control thread to")
     fifo: int | None = Field(

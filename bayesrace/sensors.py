@@ -24,6 +24,7 @@ from bayesrace.defaults import Option
 from bayesrace.errors import InputError
 from bayesrace.files import read_form, write_whole
 from bayesrace.messages import MOST_INSTRUMENTS, MOST_READINGS
+from bayesrace.strict import StrictModel
 
 __all__ = [
     "BUILT_IN", "EXACT", "FIELDS", "Channel", "Instrument", "Sensors", "SensorsSetting",
@@ -40,10 +41,8 @@ _EVENTS: Final = 60
 """A few less than BR_EVENTS in controller/native/bayesrace_estimator.h."""
 
 
-class Channel(BaseModel):
+class Channel(StrictModel):
     """How one quantity is measured; all in its unit, but for ``relative``."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     deviation: float = Field(ge=1e-12, le=1e3, description="standard deviation of white noise")
     relative: float = Field(
@@ -67,10 +66,8 @@ Measured = Annotated[
 """A number is the deviation alone."""
 
 
-class Instrument(BaseModel):
+class Instrument(StrictModel):
     """One sensor, or several that measure at the same moments."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     rate_hz: float = Field(ge=0.1, le=1e4, description="measurements in a second [Hz]")
     delay_s: float = Field(0.0, ge=0, le=1, description="from measurement to report [s]")

@@ -2,10 +2,11 @@
 
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import Field, field_validator
 
 from bayesrace.defaults import MAX_POINTS, PATH_ROWS
 from bayesrace.integrators import PERFECT, PREDICTION, Discretisation
+from bayesrace.strict import StrictModel
 from bayesrace.vehicles import DEFAULT_CAR, Car, CarSetting, default_car, get_car
 
 __all__ = ["BuildSettings", "ProblemName"]
@@ -13,10 +14,8 @@ __all__ = ["BuildSettings", "ProblemName"]
 ProblemName = Literal["tracking", "progress"]
 
 
-class BuildSettings(BaseModel):
+class BuildSettings(StrictModel):
     """One controller to build."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     car: CarSetting = Field(default_factory=default_car)
     model: Literal["e_kinematic", "dynamic"] = Field(

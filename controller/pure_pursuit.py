@@ -11,11 +11,12 @@ import math
 from typing import Final, Literal, NamedTuple
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from bayesrace.arrays import Floats
 from bayesrace.controller.interface import NO_LIMITS, Environment, StepOutput
 from bayesrace.errors import InputError
+from bayesrace.strict import StrictModel
 from bayesrace.vehicles.parameters import Car
 
 __all__ = ["DrivingStyle", "PurePursuit", "PurePursuitSettings", "dead_reckoning", "turning"]
@@ -35,10 +36,8 @@ _WINDOW: Final = 0.25
 """Of the distance of the target: points before and behind by which the line's bends are found."""
 
 
-class PurePursuitSettings(BaseModel):
+class PurePursuitSettings(StrictModel):
     """How it drives; what depends on the car's size is in the car's tuning."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     style: DrivingStyle = Field(
         default="limit",

@@ -5,9 +5,10 @@ import math
 from statistics import NormalDist
 from typing import Annotated, Any, Final, Literal, get_args
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from bayesrace.defaults import Option
+from bayesrace.strict import StrictModel
 from bayesrace.vehicles import Car
 from bayesrace.vehicles.parts import GRAVITY_MPS2
 
@@ -36,10 +37,8 @@ def _objective(text: str) -> Any:
     return Field(None, gt=0, description=f"{text}; the car's, from its tuning, without")
 
 
-class MpcSettings(BaseModel):
+class MpcSettings(StrictModel):
     """All of these can change between two steps; nothing needs a recompilation."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     q_position: float | None = _objective("Q: squared position error [1/m^2]")
     r_duty: float | None = _objective("R: squared change of the drive command")
@@ -118,10 +117,8 @@ class MpcSettings(BaseModel):
         return values | {name: getattr(car, name) for name in limits}
 
 
-class FallbackSettings(BaseModel):
+class FallbackSettings(StrictModel):
     """How far down, how fast: see controller/native/br_fallback.c."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     shifted_s: Annotated[float, Option("--bridge", unit="ms", per_unit=1000)] = Field(
         default=0.1, ge=0, le=2, description="how long after its first input a plan may be driven"
@@ -142,13 +139,11 @@ CompensationMode = Literal["off", "measured", "fixed"]
 """In the order of br_compensation in controller/native/bayesrace_cycle.h."""
 
 
-class CompensationSettings(BaseModel):
+class CompensationSettings(StrictModel):
     """Over which delay the state is predicted: see controller/native/br_state.c.
 
     Also by a text: the mode, or milliseconds of a fixed delay.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     mode: CompensationMode = Field(
         "measured", description="off: the state is taken as it is, as if everything were at once"
@@ -172,7 +167,7 @@ class CompensationSettings(BaseModel):
             raise ValueError(f"give {known}, not '{value}'") from None
 
 
-class GateSettings(BaseModel):
+class GateSettings(StrictModel):
     """When new weights are refused, and when they are rolled back.
 
     One-step errors are compared as velocities after one Ts. The new weights are worse if for any
@@ -187,8 +182,6 @@ class GateSettings(BaseModel):
     ``few`` is 100, the samples that the watch compares on, over the number of samples, and at
     least 1: a handful of samples, as after a standing start, must be far worse.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     worse_factor: float = Field(1.2, ge=1, description="errors may grow by this factor, and")
     worse_share: float = Field(
@@ -229,10 +222,8 @@ class GateSettings(BaseModel):
         }
 
 
-class CycleSettings(BaseModel):
+class CycleSettings(StrictModel):
     """Of the control cycle, whatever hands it the states: see controller/native/br_cycle.c."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     compensation: Annotated[
         CompensationSettings, Option("--delay", metavar="DELAY", default="measured")

@@ -3,9 +3,10 @@
 from collections.abc import Callable
 from typing import Final, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from bayesrace.defaults import MAX_POINTS
+from bayesrace.strict import StrictModel
 
 __all__ = [
     "DEFAULT_KERNELS",
@@ -35,10 +36,8 @@ WIDEN: Final = 1.45
 """Of first weights: what first laps on many tracks take for a band that holds."""
 
 
-class TrainingSettings(BaseModel):
+class TrainingSettings(StrictModel):
     """How to train; the defaults use training samples alone to decide."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     kernels: tuple[Kernel, ...] = Field(
         DEFAULT_KERNELS, min_length=1, description="candidates; held-out log density decides"

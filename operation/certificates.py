@@ -26,11 +26,12 @@ from cryptography.hazmat.primitives.serialization import (
     load_pem_private_key,
 )
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import Field, ValidationError
 
 from bayesrace.errors import InputError, faults_in
 from bayesrace.files import claimed, read_text, write_whole
 from bayesrace.messages import Role, is_car_name
+from bayesrace.strict import StrictModel
 from bayesrace.transport.credentials import (
     AUTHORITY,
     CERTIFICATE,
@@ -62,11 +63,9 @@ class Entry(Member):
     revoked: bool = False
 
 
-class _Register(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
+class _Register(StrictModel):
     number: int = Field(0, description="of the list of members made of it")
-    entries: dict[str, Entry] = {}
+    entries: dict[str, Entry] = Field({}, description="by their names")
 
 
 def init(folder: Path, passphrase: str = "") -> None:

@@ -20,6 +20,7 @@ from bayesrace.errors import InputError
 from bayesrace.files import read_form, write_whole
 from bayesrace.messages import QUANTITIES, Reading, State
 from bayesrace.sensors import Sensors
+from bayesrace.strict import StrictModel
 
 __all__ = ["READING_FAULTS", "STATE_FAULTS", "FaultPlayer", "ReadingFault", "SensorFault"]
 __all__ += ["SensorFaults", "SensorFaultsSetting", "StateFault", "write_sensor_faults"]
@@ -144,10 +145,8 @@ READING_FAULTS: Final[Mapping[str, ReadingFault]] = {
 # In a run ----------------------------------------------------------------------------------------
 
 
-class SensorFault(BaseModel):
+class SensorFault(StrictModel):
     """One fault: of what, which, and when."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     fault: str = Field(description=f"one of {', '.join(STATE_FAULTS)}; of an instrument, one of "
                        f"{', '.join(READING_FAULTS)}")  # fmt: skip

@@ -3,11 +3,12 @@
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from bayesrace.defaults import Option
 from bayesrace.plant.world import UNCHANGED, World, WorldSetting
 from bayesrace.sensors import Sensors, SensorsSetting
+from bayesrace.strict import StrictModel
 from bayesrace.vehicles import CarSetting, default_car
 
 __all__ = ["CarSimulation", "SimulatorName"]
@@ -16,10 +17,8 @@ SimulatorName = Literal["equations", "slipx"]
 """What simulates the car where no FMU does."""
 
 
-class CarSimulation(BaseModel):
+class CarSimulation(StrictModel):
     """The car, what simulates it, and what lies between it and the controller."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     car: CarSetting = Field(default_factory=default_car)
     fmu: Path | None = Field(

@@ -21,6 +21,7 @@ from pydantic import (
 from bayesrace.defaults import Option
 from bayesrace.errors import InputError
 from bayesrace.files import read_form, write_whole
+from bayesrace.strict import StrictModel
 from bayesrace.vehicles import Car
 from bayesrace.vehicles.parts import DcMotor
 
@@ -32,10 +33,8 @@ What = Literal["grip", "mass", "motor"]
 _WHATS: Final[tuple[What, ...]] = get_args(What)
 
 
-class Change(BaseModel):
+class Change(StrictModel):
     """One change: of what, by how much, when and where. Changes of the same are multiplied."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     what: What = Field(description="grip (tyre forces), mass, or motor (its force)")
     share: float = Field(ge=0.05, le=5, description="of what it was [-]")

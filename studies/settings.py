@@ -18,6 +18,7 @@ from bayesrace.errors import InputError
 from bayesrace.files import read_text
 from bayesrace.operation.settings import PreparationSettings, RaceSettings
 from bayesrace.raceline import RaceLineSettings
+from bayesrace.strict import StrictModel
 from bayesrace.tracks import DEFAULT_RACE_TRACK
 from bayesrace.vehicles import CarSetting, default_car
 
@@ -78,10 +79,8 @@ DRIVES: Final = "DYN-PP-ETHZMobil.npz", "DYN-GPMPC-ETHZ.npz", "DYN-NMPC-ETHZ.npz
 """Published drives: pure pursuit, BayesRace's lap, BestCase's lap."""
 
 
-class PaperSettings(BaseModel):
+class PaperSettings(StrictModel):
     """What to reproduce the paper from; InputError for missing files."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     tracks: Annotated[Path | None, Option(metavar="DIR")] = Field(
         None,

@@ -9,10 +9,11 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from bayesrace.arrays import Floats
 from bayesrace.errors import InputError
+from bayesrace.strict import StrictModel
 from bayesrace.tracks.tables import read_table, write_table
 
 __all__ = ["LimitLap", "LimitSettings", "read_limit", "write_limit"]
@@ -27,10 +28,8 @@ _KEYS: Final = {
 }  # fmt: skip
 
 
-class LimitSettings(BaseModel):
+class LimitSettings(StrictModel):
     """Settings of :func:`bayesrace.limit.compute_limit`."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     standing: bool = Field(False, description="from the start pose; otherwise a flying lap")
     start_speed_mps: float = Field(

@@ -12,11 +12,12 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from bayesrace.arrays import Floats
 from bayesrace.cache import digest
 from bayesrace.errors import InputError
+from bayesrace.strict import StrictModel
 from bayesrace.tracks import Track
 from bayesrace.tracks.tables import read_table, write_table
 from bayesrace.vehicles.parameters import Car
@@ -46,10 +47,8 @@ class RaceLineError(RuntimeError):
     """The optimiser found no racing line; the message says how it ended and what may help."""
 
 
-class RaceLineSettings(BaseModel):
+class RaceLineSettings(StrictModel):
     """Settings of :func:`bayesrace.raceline.compute_raceline`; the car's tuning has its steps."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     friction: float | None = Field(
         default=None, gt=0, le=5, description="horizontal acceleration over g; None: the car's"

@@ -11,11 +11,12 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import Field, ValidationError
 
 from bayesrace.errors import InputError, TransientError, faults_in
 from bayesrace.files import check_private, read_text, write_whole
 from bayesrace.messages import Role
+from bayesrace.strict import StrictModel
 
 if TYPE_CHECKING:
     import ssl
@@ -53,10 +54,8 @@ _COPYING_S: Final = 5.0
 _COPY: Final = "copy the folder again, as 'bayesrace certs' wrote it"
 
 
-class Member(BaseModel):
+class Member(StrictModel):
     """What the bearer of a certificate may do."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     role: Role
     car: str = Field(EVERY_CAR, description="name of the one car that it concerns; *: every car")
@@ -66,10 +65,8 @@ class Member(BaseModel):
         return role == self.role or role in COVERS.get(self.role, ())
 
 
-class Members(BaseModel):
+class Members(StrictModel):
     """Everyone with a certificate that counts."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     number: int = Field(0, description="higher than those of all lists before")
     members: dict[str, Member] = Field({}, description="by the name in the certificate")
@@ -89,10 +86,8 @@ class Members(BaseModel):
             )
 
 
-class Credentials(BaseModel):
+class Credentials(StrictModel):
     """The certificate of one process, checked, with what all members may do."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     folder: Path
     name: str = Field(description="common name in the certificate")

@@ -9,10 +9,11 @@ from contextlib import contextmanager, suppress
 from tempfile import gettempdir
 from typing import Annotated, Any, Final, Literal, NamedTuple
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, JsonValue
+from pydantic import AfterValidator, Field, JsonValue
 
 from bayesrace.errors import InputError
 from bayesrace.files import temporary_folder
+from bayesrace.strict import StrictModel
 from bayesrace.transport.credentials import Credentials
 
 __all__ = [
@@ -152,10 +153,8 @@ ZenohSettings = Annotated[dict[str, JsonValue], AfterValidator(_beside_ours)]
 """Settings of Zenoh, nested or by their paths, but for those that are made of ours."""
 
 
-class LinkLimits(BaseModel):
+class LinkLimits(StrictModel):
     """What links may cost, and how soon a silent one is closed."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     lease_s: float = Field(
         5.0, gt=0, le=600, description="silence after which a link is closed; shorter stalls pass"
@@ -170,10 +169,8 @@ class LinkLimits(BaseModel):
     sessions: int = Field(1000, ge=1, le=100_000, description="processes that are linked at once")
 
 
-class Endpoints(BaseModel):
+class Endpoints(StrictModel):
     """Endpoints that a process listens on and connects to, and what holds for its links."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     listen: tuple[str, ...] = Field(
         default=(), description="endpoints to listen on, 'tcp/address:port'"

@@ -7,7 +7,9 @@ is (its name and its unit), and how much of it there is at a speed, are the driv
 import math
 from typing import Annotated, ClassVar, Final, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
+
+from bayesrace.strict import StrictModel
 
 __all__ = [
     "GRAVITY_MPS2",
@@ -32,10 +34,8 @@ _ANY_MPS2: Final = 1e3
 """Braking beyond that of any car."""
 
 
-class Part(BaseModel):
+class Part(StrictModel):
     """Part of a car: immutable, without unknown values."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     def numbers(self) -> dict[str, float]:
         """All its numbers by flat name: ``front_b`` is ``front.b``."""

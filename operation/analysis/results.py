@@ -5,12 +5,13 @@ from pathlib import Path
 from typing import Literal, Self
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import Field, ValidationError
 
 from bayesrace.arrays import Floats
 from bayesrace.defaults import LEAST_LOSS_S
 from bayesrace.errors import InputError, faults_in
 from bayesrace.files import read_whole, write_whole
+from bayesrace.strict import StrictModel
 
 __all__ = [
     "GpMetrics",
@@ -25,11 +26,9 @@ __all__ = [
 ]
 
 
-class ResultModel(BaseModel):
+class ResultModel(StrictModel):
     """What is written as JSON. Numbers that are not finite have no place there: what is not known
     is null."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
 class Percentiles(ResultModel):

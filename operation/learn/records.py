@@ -3,10 +3,11 @@
 from collections.abc import Mapping
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, Field
 
 from bayesrace.defaults import MAX_POINTS
 from bayesrace.integrators import PREDICTION, Discretisation
+from bayesrace.strict import StrictModel
 from bayesrace.vehicles import CarSetting, default_car
 
 __all__ = ["LapRecord", "LearnSettings", "Record", "UpdateRecord", "Verdict"]
@@ -18,10 +19,8 @@ Verdict = Literal[
 before; ``not sent``: the same were refused or rolled back before; ``failed``: the training."""
 
 
-class LearnSettings(BaseModel):
+class LearnSettings(StrictModel):
     """Settings of ``bayesrace learn``."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     car: CarSetting = Field(default_factory=default_car)
     name: str = Field(

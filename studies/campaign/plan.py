@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import Field, ValidationError, model_validator
 
 from bayesrace.cache import digest
 from bayesrace.errors import InputError, faults_in
@@ -23,6 +23,7 @@ from bayesrace.gp.weights import decode_weights
 from bayesrace.operation.settings import RaceSettings
 from bayesrace.plant.world import NONE, get_world
 from bayesrace.sensors import get_sensors
+from bayesrace.strict import StrictModel
 from bayesrace.studies.campaign.case import (
     CONTROLLERS,
     LEARNS_FROM,
@@ -48,10 +49,8 @@ _TRAINING: Final = (
 _Drawn = Callable[[np.random.Generator], Any]  # a value by random numbers
 
 
-class _Draw(BaseModel):
+class _Draw(StrictModel):
     """A value between two, drawn evenly, or evenly in its logarithm; whole between whole ones."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     low: int | float
     high: int | float
@@ -71,10 +70,8 @@ class _Draw(BaseModel):
         return float(f"{drawn:.6g}")  # as it is printed
 
 
-class _Plan(BaseModel):
+class _Plan(StrictModel):
     """The file's first lines and its tables."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     controllers: tuple[Controller, ...] = Field(
         PAPER, min_length=1, description=f"who drives: some of {', '.join(CONTROLLERS)}"

@@ -3,10 +3,11 @@
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from bayesrace.defaults import Option
 from bayesrace.realtime import RealtimeSettings
+from bayesrace.strict import StrictModel
 from bayesrace.transport import Endpoints
 from bayesrace.vehicles import CarSetting, default_car
 
@@ -18,10 +19,8 @@ def _own_track(known: dict[str, Any]) -> str:
     return "" if elsewhere or "car" not in known else str(known["car"].race_track)
 
 
-class LatencySettings(BaseModel):
+class LatencySettings(StrictModel):
     """What to measure, and for how long."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     car: CarSetting = Field(default_factory=default_car)
     log: Path | None = Field(None, description="log of a run (MCAP), in place of a new run")

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, Self
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BeforeValidator, Field, ValidationError, model_validator
 
 from bayesrace.controller.process_settings import ControllerSettings
 from bayesrace.controller.settings import MpcSettings
@@ -13,6 +13,7 @@ from bayesrace.files import parse_toml, read_text
 from bayesrace.operation.settings import PreparationSettings
 from bayesrace.plant.faults import SensorFaults
 from bayesrace.plant.world import World
+from bayesrace.strict import StrictModel
 from bayesrace.studies.evidence.scenario.events import (
     KINDS,
     Event,
@@ -31,10 +32,6 @@ _REMEDY: Final = "docs/scenarios.md shows one; 'bayesrace scenario --list' names
 _CONTROL: Final = {"rate_hz", "budget", "hold", "sensor_tolerance"}
 
 
-class _Section(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
-
 def _list(given: Any) -> Any:
     return [given] if isinstance(given, str) else given
 
@@ -42,7 +39,7 @@ def _list(given: Any) -> Any:
 _Names = Annotated[tuple[str, ...], BeforeValidator(_list)]
 
 
-class Holds(_Section):
+class Holds(StrictModel):
     """What must hold, of the truth and of what was recorded. What is not given is not checked."""
 
     off_track_samples: int | None = Field(0, ge=0, description="of the whole drive, at most")
@@ -75,7 +72,7 @@ class Holds(_Section):
     happens_not: _Names = Field((), description="kinds of events that are not")
 
 
-class Scenario(_Section):
+class Scenario(StrictModel):
     """One drive of a plant and a controller process."""
 
     name: str = Field("", exclude=True)

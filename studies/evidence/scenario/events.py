@@ -4,11 +4,12 @@ from collections.abc import Callable, Iterable
 from functools import partial
 from typing import Annotated, Any, Final, Literal, Self, get_args
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from bayesrace.operation.driving_system import DrivingSystem, Part
 from bayesrace.plant.faults import SensorFault
 from bayesrace.plant.world import Change, What
+from bayesrace.strict import StrictModel
 from bayesrace.tracks import Track
 from bayesrace.transport.relay import Link
 
@@ -22,9 +23,7 @@ FindWeights = Callable[[str], Any]
 Receiver = Literal["plant", "controller", "both"]
 
 
-class _Event(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
+class _Event(StrictModel):
     at_s: float = Field(ge=0, le=3600, description="when it begins, after the start [s]")
 
     @property
