@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Annotated, Any, Final, Self
 
 from pydantic import (
-    BaseModel,
     BeforeValidator,
     ConfigDict,
     Field,
@@ -180,9 +179,7 @@ BUILT_IN: Final = {
 """Sets that have a name: poses of motion capture; fewer of them with wheel speed and gyro."""
 
 
-class _File(BaseModel):
-    model_config = ConfigDict(extra="forbid")
-
+class _File(StrictModel):
     sensors: Sensors
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Annotated, Any, Final, Self
 
 from msgspec.structs import replace
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, RootModel, model_validator
+from pydantic import BeforeValidator, ConfigDict, Field, RootModel, model_validator
 
 from bayesrace.defaults import Option
 from bayesrace.errors import InputError
@@ -217,9 +217,7 @@ class SensorFaults(RootModel[tuple[SensorFault, ...]]):
     root: tuple[SensorFault, ...] = Field((), max_length=100)
 
 
-class _File(BaseModel):
-    model_config = ConfigDict(extra="forbid")
-
+class _File(StrictModel):
     fault: SensorFaults
 
 

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Annotated, Final, Literal, Self, get_args
 
 from pydantic import (
-    BaseModel,
     BeforeValidator,
     ConfigDict,
     Field,
@@ -126,9 +125,7 @@ def changed_car(car: Car, shares: tuple[float, ...]) -> Car:
     return car.model_copy(update={"tyres": tyres, "mass_kg": mass * car.mass_kg, "drive": drive})
 
 
-class _File(BaseModel):
-    model_config = ConfigDict(extra="forbid")
-
+class _File(StrictModel):
     world: World
 
 
