@@ -195,6 +195,9 @@ def test_an_output_folder_that_cannot_be_written_is_refused(
     refused(cli("race", "--out", "file"), "file")
     refused(cli("race", "--out", "file/race"), "file/race")
     refused(cli("build", "--out", "file/artefact"), "file/artefact")
+    (tmp_path / "sources").mkdir()
+    (tmp_path / "sources" / "br_step.c").write_text("of the user")
+    refused(cli("build", "--out", "sources"), "sources", "new folder")
     if os.geteuid():
         (tmp_path / "locked").mkdir(mode=0o500)
         refused(cli("race", "--out", "locked/race"), "locked/race")

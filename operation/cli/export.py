@@ -50,6 +50,7 @@ def build(
     from bayesrace.codegen.daqp import HOW_TO_GET
     from bayesrace.codegen.platforms import get_platform
     from bayesrace.integrators import PERFECT
+    from bayesrace.manifest import MANIFEST
 
     chosen = settings()
     if chosen.model == "dynamic":
@@ -65,6 +66,8 @@ def build(
     cross = board_compiler(board) if board else None
     if out is not None:
         trusted(out, make=True)  # now, as its loader would refuse it after the work
+        if any(out.iterdir()) and not (out / MANIFEST).exists():
+            raise InputError(f"{out} holds other files; give --out a new folder")
     target = None if platform is None or board else get_platform(platform)
     own = find_compiler(by_name=True) if board else None  # CC is that of the board
     folder, _ = make(chosen, platform=target, daqp=daqp, compiler=own)
