@@ -243,6 +243,14 @@ class LogReader:
         """Parts of the recording before the first message that is read."""
         return _count(self.part.get("number", ""))
 
+    @property
+    def overwritten(self) -> bool:
+        """Whether another log is being written in place of what has been read by :meth:`newer`."""
+        with suppress(OSError):
+            part = part_path(self.path, self._place.number)
+            return part.stat().st_size < self._place.offset
+        return False
+
     def contents(self) -> tuple[set[str], dict[str, dict[str, str]]]:
         """:meth:`channels` and :meth:`metadata`, which take a whole reading each."""
         keys: set[str] = set()

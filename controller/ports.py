@@ -70,9 +70,13 @@ class SerialPort:
             raise InputError(f"'{device}' is no serial line: {error.args[-1]}") from None
         try:
             termios.tcsetattr(self._file, termios.TCSANOW, [0, 0, flags, 0, speed, speed, control])
+            has = termios.tcgetattr(self._file)[4:6]
         except (OSError, termios.error) as error:
             self.close()
             raise InputError(f"'{device}' is no serial line: {error.args[-1]}") from None
+        if has != [speed, speed]:
+            self.close()
+            raise InputError(f"'{device}' cannot have a rate of {rate}; give another one")
         self.frames, self._device = FrameReader(), device
         self._came: deque[bytes] = deque()
         self._poll = select.poll()

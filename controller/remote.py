@@ -34,6 +34,8 @@ __all__ = ["RemoteController", "RemoteDriver", "RemoteLink"]
 _STATE: Final = head_of(STATE)
 _REPEAT_NS: Final = 100_000_000
 """Between two commands that have had no effect yet: datagrams may be lost."""
+_GONE_NS: Final = 2_000_000_000
+"""After a go the car drives for so long: it has been let go."""
 _FARTHEST: Final = 256
 """From one state of a run to the next that is driven on; as ``controller/native/br_state.c``."""
 _SILENT_NS: Final = 1_000_000_000
@@ -135,6 +137,8 @@ class RemoteDriver:
         """Monotonic clock at the first state since the newest answer, 0 if none has come since; at
         the newest state."""
         self._wanted, self._commands, self._commanded_ns = "", 0, 0
+        self._stood = False
+        """When the newest command was sent."""
 
     def take(self, state: State) -> bool:
         """A state has come, to be forwarded next; whether it is of the run that is driven."""
@@ -260,16 +264,21 @@ class RemoteDriver:
         self._command("go")
 
     def repeat(self) -> None:
-        """The newest command, while the car is driven and it has had no effect."""
-        phase = self.phase
-        opposite = (phase is Phase.STOPPED) != (self._wanted == "stop")
-        due = clock.monotonic_ns() - self._commanded_ns > _REPEAT_NS
-        if self._wanted and due and opposite and phase is not Phase.WAITING:
-            self._command(self._wanted)
+        """The newest command, while the car is driven and it has had no effect. A go that has had
+        one is over: who else stops the car afterwards has stopped it."""
+        if (phase := self.phase) is Phase.WAITING or not self._wanted:
+            return
+        stands, past_ns = phase is Phase.STOPPED, clock.monotonic_ns() - self._commanded_ns
+        if stands != (self._wanted == "stop"):
+            if past_ns > _REPEAT_NS:
+                self._command(self._wanted)
+        elif self._wanted == "go" and (self._stood or past_ns > _GONE_NS):
+            self._wanted = ""
 
     def _command(self, command: str) -> None:
         now_ns = clock.monotonic_ns()
         message = Command(seq=self._commands, source_time_ns=now_ns, command=command, text="bridge")
         self._wanted, self._commanded_ns = command, now_ns
+        self._stood = self.phase is Phase.STOPPED
         self._commands += 1
         self._link.send(to_datagram(COMMAND, message))

@@ -129,9 +129,10 @@ class RemoteAdoption:
 
     def adopt(self, packed: bytes, version: str, watched: bool, reverted: int) -> int:
         """See :class:`.Adopter`."""
-        data, until_s = self._file_of(packed, version), time.monotonic() + _STAGING_S
+        data = self._file_of(packed, version)
         for at in range(0, len(data), PIECE_BYTES):
             self._ask("write", at=at, data=data[at : at + PIECE_BYTES])
+        until_s = time.monotonic() + _STAGING_S
         while self._ask("stage", at=len(data)).busy:
             if time.monotonic() > until_s:
                 raise AgainError("the controller has not staged them in time")

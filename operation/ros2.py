@@ -5,8 +5,10 @@ The two networks have a session each, and nothing is forwarded but what is made 
 
 import logging
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from functools import partial
 from typing import Any, Final
 
@@ -51,7 +53,7 @@ def bridge(
     with (
         open_session(endpoints, "director" if joy else "viewer") as session,
         open_node(settings, "bridge") as node,
-        ThreadPoolExecutor(2) as pool,
+        ThreadPoolExecutor(1) as pool,
     ):
         view = View(node, settings, car, course)
         if joy:
@@ -80,7 +82,7 @@ def _command(session: Any, name: str, action: str) -> None:
 
 
 class Buttons:
-    """Turns the pressing of buttons into commands, whose answers ``pool`` waits for."""
+    """Turns the pressing of buttons into commands; the one thread of ``pool`` awaits answers."""
 
     def __init__(
         self, settings: Joy, pool: ThreadPoolExecutor, command: Callable[[str], None]
@@ -88,7 +90,7 @@ class Buttons:
         self._settings, self._pool, self._command = settings, pool, command
         self._stop, self._go = False, True
         """Before the first message: a stop that is held then counts, a go does not."""
-        self._asked: dict[str, Future[None]] = {}
+        self._newest: deque[str] = deque(maxlen=1)
 
     def __call__(self, message: Any) -> None:
         """A message of the joystick; IndexError if it lacks a button."""
@@ -96,9 +98,14 @@ class Buttons:
         go = bool(message.buttons[self._settings.go_button]) and not stop
         pressed = "stop" if stop and not self._stop else "go" if go and not self._go else ""
         self._stop, self._go = stop, go
-        asked = self._asked.get(pressed)
-        if pressed and (asked is None or asked.done()):
-            self._asked[pressed] = self._pool.submit(self._command, pressed)
+        if pressed:
+            self._newest.append(pressed)
+            self._pool.submit(self._send)
+
+    def _send(self) -> None:
+        """Of what is pressed while an answer is awaited, the newest is sent, after that."""
+        with suppress(IndexError):
+            self._command(self._newest.pop())
 
 
 class View:

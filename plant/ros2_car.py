@@ -5,7 +5,7 @@ import math
 import queue
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, Final
 
 from bayesrace.errors import InputError
 from bayesrace.plant.hardware import Hardware, Report
@@ -17,6 +17,7 @@ from bayesrace.vehicles import Car
 __all__ = ["Ros2Car"]
 
 Values = dict[str, tuple[float, float]]
+_YEAR_S: Final = 3e7
 
 
 class Ros2Car(Hardware):
@@ -54,9 +55,12 @@ class Ros2Car(Hardware):
     def _take(self, instrument: str, values: Callable[[Any], Values], message: Any) -> None:
         found, stamp = values(message), message.header.stamp
         # Counted from the instrument's first one: calendar times are too large. 0: not set.
-        time_ns = stamp.sec * 10**9 + stamp.nanosec
-        clock_s = (time_ns - self._first_ns.setdefault(instrument, time_ns)) * 1e-9
-        self._arrived.put(Report(instrument, found, clock_s if time_ns else None))
+        clock_s = None
+        if time_ns := stamp.sec * 10**9 + stamp.nanosec:
+            clock_s = (time_ns - self._first_ns.setdefault(instrument, time_ns)) * 1e-9
+            if abs(clock_s) > _YEAR_S:  # the sender's clock has been set
+                self._first_ns[instrument], clock_s = time_ns, 0.0
+        self._arrived.put(Report(instrument, found, clock_s))
 
     def _pose(self, message: Any) -> Values:
         if (frame := message.header.frame_id) != self._settings.world_frame:

@@ -313,6 +313,12 @@ def test_what_the_controller_does_is_known_by_its_answers(now_ns: list[int]) -> 
     driver.repeat()  # it has had its effect
     assert len(link.sent) == 2
     assert phase_of(driver) is Phase.STOPPED
+    driver.go()
+    for status in (Status.HALTED, Status.CONVERGED, Status.HALTED):
+        driver.note(answered(status=status))
+        now_ns[0] += 2 * 10**8
+        driver.repeat()  # lost; it has had its effect; somebody else has stopped the car
+    assert len(link.sent) == 4
     with pytest.raises(InputError):
         driver.note(b"\x92\xa5state" + b"\x91" * 5000)
     link.close()

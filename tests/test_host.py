@@ -514,6 +514,15 @@ def test_unusable_settings_are_named(
         HostProgram(tmp_path).answers([])
 
 
+def test_settings_that_are_cut_off_are_named(host: HostProgram, tmp_path: Path) -> None:
+    """Within the last number, which is one then, too."""
+    shutil.copytree(host.folder, tmp_path, dirs_exist_ok=True)
+    file = tmp_path / SETTINGS_FILE
+    file.write_text(file.read_text()[:-2])
+    with pytest.raises(InputError, match="is cut off in its line"):
+        HostProgram(tmp_path).answers([])
+
+
 @pytest.mark.check
 def test_no_sanitizer_finds_anything_whatever_the_states_say(
     kinematic_artefact: Path, host: HostProgram, circuit: Circuit, tmp_path: Path

@@ -103,7 +103,7 @@ def test_weights_that_are_adopted_and_rolled_back_are_answered_by_to_the_bit(
             break
         if k in changes:
             file = weights_file(changes[k], identity, CAPACITY)
-            sent += [*ask.staged(file), ask("adopt", watched=True)]
+            sent += [*ask.staged(file), adopt := ask("adopt", watched=True)]
             native.stage_weights(pack_weights(changes[k]))
             adoption.tasks.append(Task(partial(adoption.use, changes[k].version, True), 0))
         sent.append(to_datagram(STATE, state))
@@ -111,12 +111,13 @@ def test_weights_that_are_adopted_and_rolled_back_are_answered_by_to_the_bit(
         if not driver.doubted:
             adoption.observe(driver.vx_mps, driver.fallen_back)
         cycle.answer(state, send, adoption.limits(driver.vx_mps))
-    found = answers(host, [*sent, ask("look")])
+    found = answers(host, [*sent, adopt, ask("look")])
     driving = [one for one in found if not isinstance(one, Updated)]
     assert [without_clocks(one) for one in driving] == [without_clocks(one) for one in expected]
     ((at, ruling),) = [(at, one) for at, one in adoption.done if isinstance(one, Ruling)]
     assert ruling.action == "back"
-    last = updates(found)[-1]
+    *_, first, again_asked, last = updates(found)
+    assert again_asked == first  # without the ruling since
     assert (last.rulings, last.reverted, last.ruled_at) == (1, 1, at)
     assert (last.version, ruling.data["samples"]) == (weights.version, last.samples)
     assert last.errors[0] == ruling.data["error_new_vx"]

@@ -1,5 +1,6 @@
 """What a bridge makes of its history and of what the controller says of its weights."""
 
+import time
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ from bayesrace.controller.settings import GateSettings
 from bayesrace.controller.weights.adoption import AgainError, Ruling, WeightsPort
 from bayesrace.controller.weights.store import AcceptedWeights, History
 from bayesrace.errors import InputError, RestartError
-from bayesrace.messages import RULING_ERRORS, Updated, from_datagram
+from bayesrace.messages import PIECE_BYTES, RULING_ERRORS, Updated, from_datagram
 from bayesrace.vehicles import Car
 from tests.driven import blank
 
@@ -31,6 +32,7 @@ class Program(RemoteLink):
         self._written = b""
 
     def send(self, data: bytes) -> None:
+        self.request = data
         request: Any = from_datagram(data)[1]
         if request.action in self.silent_on:
             return
@@ -102,6 +104,25 @@ def test_a_controller_that_counts_anew_is_another_one(kinematic_artefact: Path, 
     made._looked_s -= 10.0
     made.follow()
     assert made.restarted
+
+
+def test_how_long_the_pieces_take_does_not_count_for_staging(
+    kinematic_artefact: Path, car: Car, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("bayesrace.controller.remote_weights._STAGING_S", 0.1)
+    program, stages = Program(version="w0"), iter((True, False))
+    made, _ = joined(program, History(entries=[weights(0, True)]), kinematic_artefact, car)
+
+    def note(answer: Updated) -> None:
+        request: Any = from_datagram(program.request)[1]
+        if request.action == "write":
+            time.sleep(0.05)
+        busy = request.action == "stage" and next(stages)
+        made.note(replace(answer, busy=busy))
+
+    program.note = note
+    made.adopt(b"", "w" * 5 * PIECE_BYTES, True, 0)
+    assert len(program.adopted) == 1
 
 
 def test_without_an_answer_it_is_not_known_what_drives(

@@ -67,6 +67,7 @@ class Faulty(ClosedLoop):
         self._since: list[State] = []
         self.faults: list[str] = []
         """Of each state from the beginning on."""
+        self.decided_s: list[float] = []
 
     def _exchange(self, state: State, x: tuple[float, ...]) -> tuple[float, ...] | End:
         if state.time_s >= BEGIN_S - 1e-9:
@@ -74,6 +75,7 @@ class Faulty(ClosedLoop):
             if state.time_s < self._end_s - 1e-9:
                 state = self._fault(self._since)
         answer = super()._exchange(state, x)
+        self.decided_s.append(self._cycle.driver.decision.decided_at_s)
         if self._since:
             self.faults.append(self._cycle.driver.fault)
         return answer
@@ -106,6 +108,16 @@ def test_a_fault_is_noticed_and_the_car_stays_on_its_track(
     else:
         assert abs(driven.x[-1, 3]) < 0.05
         assert driven.levels[-1] == Level.STOP
+
+
+def test_states_that_are_dated_ahead_are_answered_for_the_moment_that_is(race: Racing) -> None:
+    """Else the car refuses the answer, or what it does after the last one begins too early."""
+    loop = Faulty(race.car, race.track, race.line, race.controller())
+    loop.fail(STATE_FAULTS["dated 0.1 s ahead"], EVER)
+    loop.drive(0, max_time_s=BEGIN_S + 0.5, x0=race.moments(100)[45])
+    assert len(loop.decided_s) > 50
+    decided_s = loop.decided_s[:-1]  # the last state is not answered
+    np.testing.assert_allclose(decided_s, STEP_S * np.arange(len(decided_s)), atol=1e-9)
 
 
 @pytest.mark.parametrize("name", FAULTS)

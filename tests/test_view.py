@@ -7,6 +7,7 @@ import signal
 import socket
 import time
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from dataclasses import replace
 from http.client import HTTPConnection
 from pathlib import Path
@@ -23,10 +24,10 @@ from bayesrace.messages import STATE, Telemetry
 from bayesrace.operation.analysis.race import read_race
 from bayesrace.operation.doctor import probe
 from bayesrace.operation.view import Runs, Source, Viewer, run_source, whole_page
-from bayesrace.operation.view.network import AbsentError, network_source
-from bayesrace.operation.view.sources import all_updates, driven_race
+from bayesrace.operation.view.network import AbsentError, NetworkSource, network_source
+from bayesrace.operation.view.sources import all_updates, driven_race, race_logs
 from bayesrace.tracks import load_track
-from bayesrace.transport import free_endpoint
+from bayesrace.transport import Endpoints, free_endpoint, open_session
 from bayesrace.vehicles import get_car, write_car
 from tests.browser import Page, needs_browser, page
 from tests.command_line import Cli, refused
@@ -129,6 +130,24 @@ def test_a_long_run_keeps_its_newest_rows_and_all_lap_times(
     assert all(one["from"] > 0 and 100 <= len(one["rows"]["t"]) <= 300 for one in told)
 
 
+def test_a_shadow_is_not_taken_for_the_controller_that_drives(peanut_race: Race) -> None:
+    all_of_it, source = entries(peanut_race.out / "run.mcap"), run_source(peanut_race.out)
+    with_shadow = [
+        found for one in all_of_it
+        for found in (
+            [one, replace(
+                one, key="bayesrace/orca/shadow/other/telemetry",
+                message=structs.replace(one.message, fallback=3),
+            )] if isinstance(one.message, Telemetry) else [one]
+        )
+    ]  # fmt: skip
+    alone, beside = Runs(source.track), Runs(source.track)
+    alone.take(all_of_it, whole=True)
+    beside.take(with_shadow, whole=True)
+    assert len(with_shadow) > len(all_of_it)
+    assert beside.updates({}) == alone.updates({})
+
+
 def test_who_joins_in_mid_run_counts_laps_as_the_car_does(peanut_race: Race) -> None:
     """The lap that is being driven then has no time."""
     source = run_source(peanut_race.out)
@@ -170,6 +189,36 @@ def test_a_log_that_another_one_takes_the_place_of_is_noticed(tmp_path: Path) ->
     raced(tmp_path / "b")
     (tmp_path / "b" / "run.mcap").replace(tmp_path / "a" / "run.mcap")
     assert source.replaced
+
+
+def test_a_car_that_is_gone_leaves_its_place(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("bayesrace.operation.view.network._MOST_CARS", 1)
+    with open_session(Endpoints()) as session, ExitStack() as stack:
+        source = NetworkSource(stack, session, tmp_path, "", "", None, get_car("orca"))
+        source.notice("one", "")
+        source.notice("two", "")
+        assert source.faults == {"two": "car 'two' is left out: no more than 1 are shown"}
+        monkeypatch.setattr("bayesrace.operation.view.network._SILENT_S", 0.0)
+        source.notice("two", "")
+        assert (source.faults, list(source._readers)) == ({}, ["two"])
+
+
+def test_a_log_that_another_one_is_written_over_is_noticed(tmp_path: Path) -> None:
+    source = shown(raced(tmp_path))
+    path = tmp_path / "run.mcap"
+    path.write_bytes(path.read_bytes()[:5000])  # in place, as by 'drive --log'
+    assert source.replaced
+
+
+def test_of_logs_that_are_dated_ahead_none_is_the_newest(tmp_path: Path) -> None:
+    """As of a machine whose clock was set back since."""
+    for name, at_s in (("now", time.time()), ("ahead", time.time() + 1e6)):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "run.mcap").write_bytes(b"")
+        os.utime(tmp_path / name / "run.mcap", (at_s, at_s))
+    assert [one.parent.name for one in race_logs(tmp_path)] == ["ahead", "now"]
 
 
 def test_a_damaged_log_says_so(tmp_path: Path) -> None:

@@ -327,7 +327,7 @@ class BrakingPlan(Message, frozen=True, kw_only=True):
 
     epoch: Count
     run: Count
-    begins_s: Annotated[float, Meta(ge=0.0, le=1e6)]
+    begins_s: Seconds
     """Plant time from which the first row acts."""
     step_s: Annotated[float, Meta(ge=1e-3, le=1.0)]
     """Time from one row to the next."""

@@ -227,8 +227,10 @@ static int read_settings(const reader *r, const char *folder, setting *settings,
     char line[LINE_BYTES];
     int failed = 0;
     while (!failed && fgets(line, sizeof line, file))
-        failed = strlen(line) + 1 < sizeof line ? take_line(r, line, settings, count)
-                                                : wrong(r, "has a line that is too long", line);
+        failed = strlen(line) + 1 >= sizeof line ? wrong(r, "has a line that is too long", line)
+                 : !strchr(line, '\n')           ? wrong(r, "is cut off in its line", line)
+                                                 : take_line(r, line, settings, count);
+    if (!failed && ferror(file)) failed = wrong(r, "is missing or cannot be read", ANEW);
     fclose(file);
     for (int i = 0; i < count && !failed; ++i)
         if (!settings[i].found) failed = wrong(r, "lacks a line", settings[i].name);

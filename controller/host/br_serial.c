@@ -111,8 +111,10 @@ static int open_serial(br_link *link, const char *where, char *text, size_t size
     if (snprintf(device, sizeof device, "%.*s", length, where) >= (int)sizeof device)
         return br_refused(text, size, where, "the name is too long");
     link->in = link->out = open(device, O_RDWR | O_NOCTTY | O_NONBLOCK | O_CLOEXEC);
-    if (link->in < 0 || tcsetattr(link->in, TCSANOW, &raw))
+    if (link->in < 0 || tcsetattr(link->in, TCSANOW, &raw) || tcgetattr(link->in, &raw))
         return br_refused(text, size, device, strerror(errno));
+    if (cfgetispeed(&raw) != speed || cfgetospeed(&raw) != speed)
+        return br_refused(text, size, where, "the line cannot have this rate; give another one");
     link->line = calloc(1, sizeof *link->line);
     return link->line ? 0 : br_refused(text, size, device, strerror(errno));
 }

@@ -90,7 +90,7 @@ void br_update_close(br_update *update) {
 static void record(br_update *update, br_mpc_ruling ruling, int64_t cycle) {
     const br_mpc_trial *trial = &update->trial;
     const br_mpc_watch *found = &trial->found;
-    br_updated_message *m = &update->answer;
+    br_updated_message *m = &update->now;
     m->rulings += 1;
     m->reverted += ruling >= BR_BACK;
     m->ruling = ruling;
@@ -148,7 +148,7 @@ static const char *write_piece(br_update *update) {
 }
 
 static const char *read_piece(br_update *update) {
-    br_updated_message *answer = &update->answer;
+    br_updated_message *answer = &update->now;
     const size_t at = (size_t)update->request.at;
     if (at >= sizeof update->buffer) return "the buffer is not as long";
     const size_t left = sizeof update->buffer - at;
@@ -171,7 +171,7 @@ static const char *stage_file(br_update *update, int waits) {
             sem_post(&update->begin);
     }
     const int found = atomic_load(&update->staging);
-    update->answer.busy = found == BR_STAGING_BUSY;
+    update->now.busy = found == BR_STAGING_BUSY;
     if (found == BR_STAGING_BUSY) return NULL;
     atomic_store(&update->staging, BR_STAGING_IDLE);
     update->has_staged = found == BR_STAGING_DONE;
@@ -180,7 +180,7 @@ static const char *stage_file(br_update *update, int waits) {
 
 static const char *adopt(br_update *update) {
     const br_update_message *request = &update->asked;
-    if (request->reverted != update->answer.reverted) return GONE_BACK;
+    if (request->reverted != update->now.reverted) return GONE_BACK;
     const int64_t begin_ns = br_now_ns();
     /* an older file may still be staged where the newest could not be */
     const br_mpc_error error =
@@ -195,20 +195,20 @@ static const char *adopt(br_update *update) {
     }
     memset(&update->trial, 0, sizeof update->trial);
     update->limit_mps = 0;
-    update->answer.adoption_us = (double)(br_now_ns() - begin_ns) * 1e-3;
+    update->now.adoption_us = (double)(br_now_ns() - begin_ns) * 1e-3;
     double lost_s = 0;
     br_mpc_get_loss(update->mpc, &lost_s);
-    update->answer.unknown_s = fmin(fmax(lost_s, -LARGEST_LOSS_S), LARGEST_LOSS_S);
+    update->now.unknown_s = fmin(fmax(lost_s, -LARGEST_LOSS_S), LARGEST_LOSS_S);
     return NULL;
 }
 
 static const char *copy_samples(br_update *update) {
     double *numbers = update->buffer.numbers;
     int count = 0;
-    if (update->request.reverted != update->answer.reverted) return GONE_BACK;
+    if (update->request.reverted != update->now.reverted) return GONE_BACK;
     br_mpc_get_samples(update->mpc, numbers, numbers + BR_SAMPLES * BR_NZ,
                        numbers + BR_SAMPLES * (BR_NZ + BR_NE), &count);
-    update->answer.size = count;
+    update->now.size = count;
     return NULL;
 }
 
@@ -229,15 +229,16 @@ static const char *carry_out(br_update *update, int waits) {
 }
 
 static void answer(br_update *update, int64_t cycle, const char *error) {
-    br_updated_message *m = &update->answer;
+    br_updated_message *m = &update->now;
     m->cycle = cycle;
     strcpy(m->error, error ? error : "");
     strcpy(m->version, update->in_use);
     m->source_time_ns = br_now_ns();
+    update->answer = *m;
 }
 
 int br_update_serve(br_update *update, int64_t cycle, int waits) {
-    br_updated_message *m = &update->answer;
+    br_updated_message *m = &update->now;
     const int64_t behind = m->seq - update->request.seq;
     if (update->answered && behind >= 0 && behind < LATE) return !update->adopts;
     update->answered = 1;

@@ -30,7 +30,8 @@ typedef struct {
         double numbers[BR_SAMPLES * BR_SAMPLE_NUMBERS]; /* features, residuals, their variances */
     } buffer;
     br_update_message request, asked; /* the newest; the newest to adopt */
-    br_updated_message answer;        /* also to the request before, which may come again */
+    br_updated_message now, answer;   /* with what the watch has found since; as it was given: the
+                                       * same again where the request comes again */
     int answered, adopts;             /* 1: the request is to adopt, and that is still to be done */
 
     /* Staging, by a thread of its own while the car is driven in real time. */

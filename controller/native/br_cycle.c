@@ -537,8 +537,6 @@ br_mpc_error br_cycle_decide(br_cycle *cycle, const br_environment *environment,
     if (!isfinite(decided_at_s) || !isfinite(budget_s) || !isfinite(spent_s)) return BR_ERROR_TIME;
     br_decision *decision = &cycle->decision;
     const br_measured *newest = &cycle->stream.newest;
-    if (cycle->doubt) /* the caller takes its time from states that may be dated ahead */
-        decided_at_s -= fmax(cycle->monitor.measured_s - newest->time_s, 0);
     decision->epoch = newest->epoch;
     decision->run = newest->run;
     decision->seq = newest->seq;

@@ -204,11 +204,16 @@ class WeightUpdateManager:
         target = entries[-2]
         history = self._history.model_copy()
         history.roll_back(target, withdraw=False)
+        why, proven = f"on request: {message.text}", history.reference
         if not target.proven:  # the watch over it goes back to what was proven then
-            proven = history.reference
-            self.adoption.adopt(proven.packed, proven.version, False, reverted)
-        cycle = self.adoption.adopt(target.packed, target.version, not target.proven, reverted)
-        why = f"on request: {message.text}"
+            halfway = self.adoption.adopt(proven.packed, proven.version, False, reverted)
+        try:
+            cycle = self.adoption.adopt(target.packed, target.version, not target.proven, reverted)
+        except InputError:
+            if not target.proven:
+                self._rolled_back(proven, "request", f"{why}; only half the way", halfway)
+                self._keep()
+            raise
         return self._kept(*self._rolled_back(target, "request", why, cycle))
 
     def _kept(self, text: str, data: _Data) -> _Answer:

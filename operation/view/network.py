@@ -48,8 +48,9 @@ class NetworkSource(Source):
         same, if it is at hand."""
         shown = name or (track.name if track else "network")
         super().__init__(None, track, None, car, f"{shown} · live")
-        self._stack, self._session, self._folder = stack, session, folder
+        self._session, self._folder = session, folder
         self._recorders: dict[str, Recorder] = {}
+        stack.callback(self._close)
         self._numbers, self._heard_s = count(), dict[str, float]()
         self._driven, self._named = driven, False
         self._inbox = Inbox(session, name or None)
@@ -69,34 +70,50 @@ class NetworkSource(Source):
         silent_s = time.monotonic() - _SILENT_S
         for car in [one for one in self.faults if self._heard_s.get(one, math.inf) < silent_s]:
             del self.faults[car]
+        shown = self._recorders.keys() | self.faults.keys()
+        self._heard_s = {car: at_s for car, at_s in self._heard_s.items() if car in shown}
         return super().read()
 
     def notice(self, car: str, driven: str) -> None:
         """A car that is there is shown from now on, or left out if its controller drives another
         track; ``driven``: the identity of that, empty if it names none."""
+        self._heard_s[car] = time.monotonic()
         if driven and not self._driven:
             self._named = True
         elif driven and not same_track(driven, self._driven):
             self._leave_out(car, f"it drives the track '{driven}', not '{self._driven}'")
             if car in self._recorders:
-                self._recorders.pop(car).close(patience_s=0)
-                rmtree(self._readers.pop(car).path.parent)
+                self._leave(car)
         elif car in self._recorders:
             return
-        elif len(self._recorders) >= _MOST_CARS:
+        elif len(self._recorders) >= _MOST_CARS and not self._leave_silent():
             self._leave_out(car, f"no more than {_MOST_CARS} are shown")
         else:
             self.faults.pop(car, None)
             log = self._folder / str(next(self._numbers)) / "car.mcap"
             log.parent.mkdir()
             recorder = Recorder(self._session, car, log, most_bytes=_MOST_BYTES)
-            # Of cars that drive, stragglers never end, and nobody waits for theirs.
-            self._stack.callback(recorder.close, patience_s=0)
             self._recorders[car], self._readers[car] = recorder, LogReader(log)
+
+    def _leave_silent(self) -> bool:
+        """Whether a car that is not heard any more has left its place to another one."""
+        silent = min(self._recorders, key=lambda car: self._heard_s[car])
+        if time.monotonic() - self._heard_s[silent] < _SILENT_S:
+            return False
+        self._leave(silent)
+        return True
+
+    def _leave(self, car: str) -> None:
+        # Of cars that drive, stragglers never end, and nobody waits for theirs.
+        self._recorders.pop(car).close(patience_s=0)
+        rmtree(self._readers.pop(car).path.parent)
+
+    def _close(self) -> None:
+        for recorder in self._recorders.values():
+            recorder.close(patience_s=0)
 
     def _leave_out(self, car: str, why: str) -> None:
         if car in self.faults or len(self.faults) < _MOST_CARS:
-            self._heard_s[car] = time.monotonic()
             self.faults[car] = f"car '{car}' is left out: {why}"
 
 

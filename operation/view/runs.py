@@ -328,7 +328,9 @@ class Runs:
         """New messages, in order; ``whole``: there are no more."""
         heard = set()
         for entry in entries:
-            car, message = entry.key.split("/")[1], entry.message
+            (_, car, kind, *_), message = entry.key.split("/"), entry.message
+            if kind == "shadow":  # it does not drive
+                continue
             if isinstance(message, Event):
                 self._event(car, message)
             elif isinstance(message, State | Truth):

@@ -79,10 +79,11 @@ class Viewer:
         query = f"/?token={self._token}" if self._token else "/"
         self.address = f"http://{in_url(host)}:{self._port}{query}"
         """Of the page."""
+        self._thread = threading.Thread(target=self._server.serve_forever, name="view", daemon=True)
         logging.getLogger("websockets").setLevel(logging.CRITICAL)
 
     def __enter__(self) -> Self:
-        threading.Thread(target=self._server.serve_forever, name="view", daemon=True).start()
+        self._thread.start()
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -94,7 +95,13 @@ class Viewer:
             self._source, self._number = source, self._number + 1
 
     def read(self) -> list[Entry[Any]]:
-        """Takes in what has been added to the source's log, and returns it."""
+        """Takes in what has been added to the source's log, and returns it. InputError once no
+        page can connect any more."""
+        if not self._thread.is_alive():
+            raise InputError(
+                "no page can connect any more, as where file descriptors run out (ulimit -n): "
+                "start it again"
+            )
         with self._lock:
             return [] if self._source is None else self._source.read()
 

@@ -1,5 +1,6 @@
 """Where the messages of a view come from: always logs, which may still be written."""
 
+import math
 import time
 from contextlib import suppress
 from dataclasses import dataclass
@@ -59,7 +60,9 @@ class Source:
     @property
     def replaced(self) -> bool:
         """Whether there is something else to show now in its place."""
-        return self.log is not None and _identity(self.log) not in (self._file, None)
+        if self.log is None or (there := _identity(self.log)) is None:
+            return False
+        return there != self._file or self._readers[""].overwritten
 
     @property
     def written(self) -> bool:
@@ -119,8 +122,9 @@ def run_source(path: Path, track: str = "", car: str = "") -> Source:
 
 
 def race_logs(folder: Path) -> list[Path]:
-    """Logs of the races that have left their runs in a folder, the newest last."""
-    return sorted(folder.glob(f"*/{_LOG}"), key=_written_s)
+    """Logs of the races that have left their runs in a folder, the newest last; those of times
+    to come, as a clock has it that was set since, are the older the later."""
+    return sorted(folder.glob(f"*/{_LOG}"), key=_age_s, reverse=True)
 
 
 def driven_race(folder: Path, than: Source | None = None) -> Source | None:
@@ -144,13 +148,12 @@ def _identity(log: Path) -> tuple[int, int] | None:
 
 def _is_written(log: Path) -> bool:
     """Whether a log has been added to just now; of a car in the network, heartbeats are."""
-    newest = max(
-        (part_path(log, number) for number in part_files(log)), key=_written_s, default=log
-    )
-    return time.time() - _written_s(newest) < _FRESH_S
+    ages_s = [_age_s(part_path(log, number)) for number in part_files(log)]
+    return min(ages_s, default=math.inf) < _FRESH_S
 
 
-def _written_s(log: Path) -> float:
+def _age_s(log: Path) -> float:
+    """Since it was added to."""
     with suppress(OSError):
-        return log.stat().st_mtime
-    return 0.0
+        return abs(time.time() - log.stat().st_mtime)
+    return math.inf

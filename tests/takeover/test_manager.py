@@ -21,7 +21,7 @@ import pytest
 
 from bayesrace.controller.assembly import PredictiveController, predictive_controller
 from bayesrace.controller.settings import GateSettings
-from bayesrace.controller.weights.adoption import Adoption, Ruling
+from bayesrace.controller.weights.adoption import Adoption, AgainError, Ruling
 from bayesrace.controller.weights.manager import WeightUpdateManager
 from bayesrace.gp.weights import Weights, encode_weights
 from bayesrace.messages import ROLLBACK, WEIGHTS, Reply, RollbackRequest
@@ -260,6 +260,26 @@ def test_back_to_weights_that_were_never_proven(
         made.drive(25, fallen_back=True)
         made.cycle()
         assert made.version == good.version
+
+
+def test_where_going_back_fails_half_the_way_the_history_knows(
+    course: Course, good: Weights, again: Weights, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with bench(course, GateSettings(watch_s=10.0)) as made:
+        made.accept(replace(again, version="one"))
+        made.accept(replace(again, version="two"))
+        adopt = made.adoption.adopt
+
+        def lost(packed: bytes, version: str, watched: bool, reverted: int) -> int:
+            if version == "one":
+                raise AgainError("a piece was lost")
+            return adopt(packed, version, watched, reverted)
+
+        monkeypatch.setattr(made.adoption, "adopt", lost)
+        reply = made.reply(made.roll_back())
+        assert (reply.accepted, made.version) == (False, good.version)
+        assert made.manager._history.in_use.version == good.version
+        assert f"back to {good.version}" in made.published("weights_rolled_back")[0]
 
 
 # The store -----------------------------------------------------------------------------------
