@@ -40,9 +40,11 @@ class Drive:
     """Events whose reading is known to be wrong."""
 
     def turned_rad(self, time_s: float) -> float:
-        """What the steering has turned since the first state, as it was commanded."""
+        """What the steering has turned since the first state, as it was commanded; what it still
+        had to turn until then, negative, if the time is in the period before."""
         passed = np.clip(time_s - self.time_s[:-1], 0, np.diff(self.time_s))
-        return float(passed @ self.u[1:, 1])
+        ahead_s = min(time_s - self.time_s[0], 0.0)
+        return float(passed @ self.u[1:, 1] + ahead_s * self.u[0, 1])
 
     @cached_property
     def events(self) -> "list[Event]":

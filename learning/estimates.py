@@ -33,6 +33,8 @@ _REMEDIES: Final = {
 
 _NX: Final = 7
 _ROUNDS: Final = 2
+_LONGEST: Final = 5_000
+"""States that are smoothed at once, which takes some 50 kB for each."""
 _NOISE: Final = 0.65
 """Of the noise that is learned from smoothed states, what is the model's. The rest is what the
 smoothing left unknown, which the next one would only confirm."""
@@ -60,13 +62,16 @@ def smoothed_states(
     known, filled = ~states["estimated"], states.copy()
     deviation, origin = np.zeros((len(states), 4)), np.full((len(states), 2), -1)
     drives: list[Drive] = []
+    found: Smoothed | None = None
     for rows in _unbroken(states, step_s):
-        drive = _drive(states[rows], cycles, step_s)
+        before = found if known[rows[0]] else None
+        drive = _drive(states[rows], cycles, step_s, before)
         found = None if drive is None else smooth(drive, car, discretisation, None)
         if drive is None or found is None:
             lost[_NO_STEERING if drive is None else _NO_POSITION] += len(rows)
             continue
         own = rows[found.rows]
+        known[rows[0]] = False  # also the last one of the part before
         filled["x"][own], known[own] = found.x[:, :_NX], True
         deviation[own] = _deviation(found, drive, car, discretisation, None)
         origin[own, 0], origin[own, 1] = len(drives), found.rows
@@ -132,20 +137,31 @@ def _surer(weights: Weights) -> Weights:
 
 
 def _unbroken(states: Columns, step_s: float) -> list[Rows]:
-    """Rows of each estimated drive in which no state is missing."""
+    """Rows of each estimated drive in which no state is missing; a long one is in parts, which have
+    the state in common at which the one ends and the next begins."""
     alike = states["estimated"][1:] == states["estimated"][:-1]
     joined = consecutive(states, step_s) & alike
     parts = np.split(np.arange(len(states)), np.flatnonzero(~joined) + 1)
-    return [part for part in parts if states["estimated"][part[0]]]
+    return [
+        part[begin : begin + _LONGEST]
+        for part in parts if states["estimated"][part[0]]
+        for begin in range(0, max(len(part) - 1, 1), _LONGEST - 1)
+    ]  # fmt: skip
 
 
-def _drive(states: Columns, cycles: Columns, step_s: float) -> Drive | None:
+def _drive(
+    states: Columns, cycles: Columns, step_s: float, before: Smoothed | None
+) -> Drive | None:
     """None where the steering angle is not known at its first state: neither is that a run's, whose
-    wheels are straight, nor has a controller estimated any."""
+    wheels are straight, nor the last one of the part ``before``, nor has a controller estimated
+    any."""
     run, seq, time_s, u = (states[name].copy() for name in ("run", "seq", "time_s", "u_applied"))
     readings = tuple(one for several in states["readings"] for one in several)
     if time_s[0] < step_s - ROUNDING:
         return Drive(time_s, u, readings)
+    if before is not None:
+        angle_rad, variance = before.x[-1, 6], before.covariance[-1, 6, 6]
+        return Drive(time_s, u, readings, float(angle_rad), float(np.sqrt(variance)))
     own = (cycles["run"] == run[0]) & (cycles["state_seq"] >= seq[0])
     own = cycles[own & (cycles["state_seq"] <= seq[-1])]
     known = [one for one in own if one["estimate"] and one["deviation"]]

@@ -334,6 +334,24 @@ def test_estimated_states_of_a_log_are_smoothed_and_their_noise_is_learned_with(
     assert not settled.drives
 
 
+def test_a_long_drive_is_smoothed_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The next one begins with the steering angle at which the one before has ended."""
+    data = drive(dynamic(CAR), 240, seed=3)
+    whole = samples_of(seen(data, 1))
+    monkeypatch.setattr("bayesrace.learning.estimates._LONGEST", 100)
+    samples = samples_of(seen(data, 1))
+    estimates = samples.estimates
+    assert estimates is not None
+    assert len(estimates.drives) == 3
+    assert len(whole) - 4 <= len(samples) <= len(whole)
+    rows = np.array([0, 99, 198])[estimates.origin[:, 0]] + estimates.origin[:, 1]
+    assert np.abs(samples.x[:, 6] - data.x[rows, 6]).max() < 1e-9
+    again = fit(samples, PREDICTION, QUICK).samples  # smoothed by the corrected model
+    for one in (samples, again):
+        off = np.abs(one.x[:, 3:6] - data.x[rows, 3:6])
+        assert (np.sqrt((off**2).mean(axis=0)) < (0.02, 0.02, 0.2)).all()
+
+
 def test_a_drive_whose_position_was_not_read_says_so() -> None:
     states = [structs.replace(one, readings=()) for one in seen(drive(dynamic(CAR), 60, seed=3), 1)]
     with pytest.raises(InputError, match=r"no position was read: .*does motion capture"):
