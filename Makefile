@@ -34,7 +34,7 @@ help:
 	@echo "make check   everything: lint, docs, all tests; names the tools that it needs"
 	@echo "make lint    ruff, clang-format, mypy, import contracts"
 	@echo "make docs    the documentation as a site: build/site/index.html"
-	@echo "make coverage  lines and branches of Python and C that 'make test' executes"
+	@echo "make coverage  lines and branches of Python and C that tests which compute execute"
 	@echo "make bench   time the compiled step beside CasADi + IPOPT"
 	@echo "make hashes  write constraints.hashed.txt, after a change of constraints.txt"
 	@echo "make release wheel, source, list of packages (SBOM) and checksums: build/release"
@@ -52,12 +52,10 @@ bench: $(VENV)/.ready
 # First the tests that compute, one a processor; then those with processes in real time, which mostly
 # wait. One of the latter that fails beside others, whose work may have made it late, is run again,
 # alone, and that counts. -m selects the tier and comes last. 5 means that ARGS selects no test of a part.
-# RUNNER: 'make coverage' measures.
-RUNNER = $(BIN)/python -m
 TIER = not check
 # Pairs of processes in real time that run at once.
 PAIRS = 3
-PYTEST = $(RUNNER) pytest --dist worksteal
+PYTEST = $(BIN)/python -m pytest --dist worksteal
 define RUN_TESTS
 	@$(PYTEST) --numprocesses auto --maxprocesses 8 $(ARGS) -m "($(TIER)) and not wall_clock"; \
 	computing=$$?; \
@@ -89,12 +87,11 @@ rest: TIER = check
 rest: $(VENV)/.ready-dev
 	$(RUN_TESTS)
 
-# Measuring makes Python two to three times slower, too slow for some tests in real time.
-coverage: RUNNER = $(BIN)/coverage run -m
-coverage: TIER = not check
+# Of the tests that compute: measuring makes Python two to three times slower, too slow for real time.
 coverage: $(VENV)/.ready-dev
 	rm -rf build/coverage
-	$(RUN_TESTS)
+	$(BIN)/coverage run -m pytest --dist worksteal --numprocesses auto --maxprocesses 8 \
+		-m "not check and not wall_clock"
 	find build/coverage -name 'data.*' -empty -delete # of processes that tests have killed
 	$(BIN)/coverage combine --quiet
 	$(BIN)/coverage report --skip-covered

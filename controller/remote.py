@@ -34,8 +34,8 @@ __all__ = ["RemoteController", "RemoteDriver", "RemoteLink"]
 _STATE: Final = head_of(STATE)
 _REPEAT_NS: Final = 100_000_000
 """Between two commands that have had no effect yet: datagrams may be lost."""
-_GONE_NS: Final = 2_000_000_000
-"""After a go the car drives for so long: it has been let go."""
+_AGAIN: Final = 5
+"""Times that a go is sent again to a car that does not stand, which cannot show its effect."""
 _FARTHEST: Final = 256
 """From one state of a run to the next that is driven on; as ``controller/native/br_state.c``."""
 _SILENT_NS: Final = 1_000_000_000
@@ -137,8 +137,9 @@ class RemoteDriver:
         """Monotonic clock at the first state since the newest answer, 0 if none has come since; at
         the newest state."""
         self._wanted, self._commands, self._commanded_ns = "", 0, 0
-        self._stood = False
-        """When the newest command was sent."""
+        self._stood, self._again = False, 0
+        """Whether the car stood when the newest command came, and how often a go that came while it
+        did not is still to be sent."""
 
     def take(self, state: State) -> bool:
         """A state has come, to be forwarded next; whether it is of the run that is driven."""
@@ -261,24 +262,30 @@ class RemoteDriver:
 
     def go(self) -> None:
         """Drive."""
+        self._stood, self._again = self.phase is Phase.STOPPED, _AGAIN
         self._command("go")
 
     def repeat(self) -> None:
-        """The newest command, while the car is driven and it has had no effect. A go that has had
-        one is over: who else stops the car afterwards has stopped it."""
-        if (phase := self.phase) is Phase.WAITING or not self._wanted:
+        """The newest command, while the car is driven: a stop until it stands; a go to one that
+        stood until it drives, to another one a few times. Then the go is over: who else stops the
+        car afterwards has stopped it."""
+        phase, now_ns = self.phase, clock.monotonic_ns()
+        if phase is Phase.WAITING or now_ns - self._commanded_ns <= _REPEAT_NS:
             return
-        stands, past_ns = phase is Phase.STOPPED, clock.monotonic_ns() - self._commanded_ns
-        if stands != (self._wanted == "stop"):
-            if past_ns > _REPEAT_NS:
-                self._command(self._wanted)
-        elif self._wanted == "go" and (self._stood or past_ns > _GONE_NS):
-            self._wanted = ""
+        stands = phase is Phase.STOPPED
+        if self._wanted == "stop":
+            if not stands:
+                self._command("stop")
+        elif self._wanted == "go":
+            self._again -= not self._stood
+            if stands if self._stood else self._again >= 0:
+                self._command("go")
+            else:
+                self._wanted = ""
 
     def _command(self, command: str) -> None:
         now_ns = clock.monotonic_ns()
         message = Command(seq=self._commands, source_time_ns=now_ns, command=command, text="bridge")
         self._wanted, self._commanded_ns = command, now_ns
-        self._stood = self.phase is Phase.STOPPED
         self._commands += 1
         self._link.send(to_datagram(COMMAND, message))

@@ -5,10 +5,8 @@ The two networks have a session each, and nothing is forwarded but what is made 
 
 import logging
 import time
-from collections import deque
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
+from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from typing import Any, Final
 
@@ -53,7 +51,7 @@ def bridge(
     with (
         open_session(endpoints, "director" if joy else "viewer") as session,
         open_node(settings, "bridge") as node,
-        ThreadPoolExecutor(1) as pool,
+        ThreadPoolExecutor(4) as pool,
     ):
         view = View(node, settings, car, course)
         if joy:
@@ -82,7 +80,7 @@ def _command(session: Any, name: str, action: str) -> None:
 
 
 class Buttons:
-    """Turns the pressing of buttons into commands; the one thread of ``pool`` awaits answers."""
+    """Turns the pressing of buttons into commands, whose answers ``pool`` waits for. Stop wins."""
 
     def __init__(
         self, settings: Joy, pool: ThreadPoolExecutor, command: Callable[[str], None]
@@ -90,7 +88,8 @@ class Buttons:
         self._settings, self._pool, self._command = settings, pool, command
         self._stop, self._go = False, True
         """Before the first message: a stop that is held then counts, a go does not."""
-        self._newest: deque[str] = deque(maxlen=1)
+        self._stops = 0
+        self._going: Future[None] | None = None
 
     def __call__(self, message: Any) -> None:
         """A message of the joystick; IndexError if it lacks a button."""
@@ -98,14 +97,18 @@ class Buttons:
         go = bool(message.buttons[self._settings.go_button]) and not stop
         pressed = "stop" if stop and not self._stop else "go" if go and not self._go else ""
         self._stop, self._go = stop, go
-        if pressed:
-            self._newest.append(pressed)
-            self._pool.submit(self._send)
+        if pressed == "stop":
+            self._stops += 1
+            self._pool.submit(self._command, pressed)
+        elif pressed and (self._going is None or self._going.done()):
+            self._going = self._pool.submit(self._send_go, self._stops)
 
-    def _send(self) -> None:
-        """Of what is pressed while an answer is awaited, the newest is sent, after that."""
-        with suppress(IndexError):
-            self._command(self._newest.pop())
+    def _send_go(self, stops: int) -> None:
+        """Unless the car is stopped first; again where it was meanwhile, as the go may be late."""
+        if stops == self._stops:
+            self._command("go")
+            if stops != self._stops:
+                self._command("stop")
 
 
 class View:

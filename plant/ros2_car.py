@@ -18,6 +18,7 @@ __all__ = ["Ros2Car"]
 
 Values = dict[str, tuple[float, float]]
 _YEAR_S: Final = 3e7
+_AGREEING_S: Final = 10
 
 
 class Ros2Car(Hardware):
@@ -29,6 +30,8 @@ class Ros2Car(Hardware):
         self._settings = settings
         self._arrived: queue.SimpleQueue[Report] = queue.SimpleQueue()
         self._first_ns: dict[str, int] = {}
+        self._odd_ns: dict[str, int] = {}
+        """Newest stamps that are years from those before."""
         read: tuple[tuple[str, str, str, Callable[[Any], Values]], ...] = (
             ("pose", own.pose, "geometry_msgs/msg/PoseStamped", self._pose),
             ("odometry", own.odometry, "nav_msgs/msg/Odometry", self._odometry),
@@ -58,8 +61,11 @@ class Ros2Car(Hardware):
         clock_s = None
         if time_ns := stamp.sec * 10**9 + stamp.nanosec:
             clock_s = (time_ns - self._first_ns.setdefault(instrument, time_ns)) * 1e-9
-            if abs(clock_s) > _YEAR_S:  # the sender's clock has been set
-                self._first_ns[instrument], clock_s = time_ns, 0.0
+            if abs(clock_s) > _YEAR_S:  # damaged; or the sender's clock has been set: two say so
+                before_ns, self._odd_ns[instrument] = self._odd_ns.get(instrument, 0), time_ns
+                clock_s = None
+                if abs(time_ns - before_ns) < 10**9 * _AGREEING_S:
+                    self._first_ns[instrument], clock_s = time_ns, 0.0
         self._arrived.put(Report(instrument, found, clock_s))
 
     def _pose(self, message: Any) -> Values:

@@ -9,7 +9,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any, Final
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
+from pydantic import BeforeValidator, ConfigDict, Field
 
 from bayesrace.codegen.settings import ProblemName
 from bayesrace.controller.settings import MpcSettings
@@ -179,10 +179,10 @@ def _every(names: list[str]) -> tuple[str, ...]:
 _Tracks = Annotated[tuple[str, ...], BeforeValidator(_every), Option(metavar="TRACK")]
 
 
-class TuneSettings(BaseModel):
+class TuneSettings(StrictModel):
     """What is searched, and on which tracks."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", validate_default=True)
+    model_config = ConfigDict(validate_default=True)
 
     car: CarSetting = Field(default_factory=default_car)
     track: _Tracks = Field(

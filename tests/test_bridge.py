@@ -8,6 +8,7 @@ import select
 import signal
 import socket
 import subprocess
+import termios
 import threading
 import time
 import tty
@@ -314,14 +315,37 @@ def test_what_the_controller_does_is_known_by_its_answers(now_ns: list[int]) -> 
     assert len(link.sent) == 2
     assert phase_of(driver) is Phase.STOPPED
     driver.go()
-    for status in (Status.HALTED, Status.CONVERGED, Status.HALTED):
+    for status, phase, sent in (
+        (Status.HALTED, Phase.STOPPED, 4),  # it was lost
+        (Status.CONVERGED, Phase.FALLBACK, 4),
+        (Status.HALTED, Phase.STOPPED, 4),  # somebody else has stopped the car
+    ):
+        driver.take(state)
         driver.note(answered(status=status))
         now_ns[0] += 2 * 10**8
-        driver.repeat()  # lost; it has had its effect; somebody else has stopped the car
-    assert len(link.sent) == 4
+        driver.repeat()
+        assert (phase_of(driver), len(link.sent)) == (phase, sent)
+    driver.note(answered(status=Status.CONVERGED))
+    driver.go()  # to a car that rolls
+    for sent in (6, 7, 8, 9, 10, 10, 10):
+        driver.take(state)
+        now_ns[0] += 2 * 10**8
+        driver.repeat()
+        assert len(link.sent) == sent
     with pytest.raises(InputError):
         driver.note(b"\x92\xa5state" + b"\x91" * 5000)
     link.close()
+
+
+def test_a_serial_line_that_cannot_have_its_rate_is_refused(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """An adapter takes the rest of the settings, and the system calls that success."""
+    _, line = os.openpty()
+    other = [0, 0, 0, 0, termios.B9600, termios.B9600, []]
+    monkeypatch.setattr(termios, "tcgetattr", lambda _: other)
+    with pytest.raises(InputError, match="cannot have a rate of 921600"):
+        RemoteLink(f"serial:{os.ttyname(line)}")
 
 
 def test_between_runs_it_waits_whatever_the_last_answer_was(now_ns: list[int]) -> None:

@@ -519,7 +519,7 @@ def test_settings_that_are_cut_off_are_named(host: HostProgram, tmp_path: Path) 
     shutil.copytree(host.folder, tmp_path, dirs_exist_ok=True)
     file = tmp_path / SETTINGS_FILE
     file.write_text(file.read_text()[:-2])
-    with pytest.raises(InputError, match="is cut off in its line"):
+    with pytest.raises(InputError, match="is cut off in its last line: export it again"):
         HostProgram(tmp_path).answers([])
 
 

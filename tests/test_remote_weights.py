@@ -1,7 +1,7 @@
 """What a bridge makes of its history and of what the controller says of its weights."""
 
-import time
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -109,18 +109,19 @@ def test_a_controller_that_counts_anew_is_another_one(kinematic_artefact: Path, 
 def test_how_long_the_pieces_take_does_not_count_for_staging(
     kinematic_artefact: Path, car: Car, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("bayesrace.controller.remote_weights._STAGING_S", 0.1)
-    program, stages = Program(version="w0"), iter((True, False))
+    program, stages, now_s = Program(version="w0"), iter((True, False)), [0.0]
     made, _ = joined(program, History(entries=[weights(0, True)]), kinematic_artefact, car)
 
     def note(answer: Updated) -> None:
         request: Any = from_datagram(program.request)[1]
         if request.action == "write":
-            time.sleep(0.05)
+            now_s[0] += 3.0
         busy = request.action == "stage" and next(stages)
         made.note(replace(answer, busy=busy))
 
     program.note = note
+    clock = SimpleNamespace(monotonic=lambda: now_s[0], sleep=lambda _: None)
+    monkeypatch.setattr("bayesrace.controller.remote_weights.time", clock)
     made.adopt(b"", "w" * 5 * PIECE_BYTES, True, 0)
     assert len(program.adopted) == 1
 

@@ -14,6 +14,7 @@ import time
 import tomllib
 from collections import defaultdict
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future
 from typing import Any
 
 import numpy as np
@@ -382,37 +383,38 @@ def test_the_page_has_every_setting_with_its_default() -> None:
     assert given_ == json.loads(Ros2Settings().model_dump_json())
 
 
-class _Pool:
-    """Of one thread, whose work is done when the test says so."""
+class _AtOnce:
+    """A pool whose work is done where it is given."""
 
-    def __init__(self) -> None:
-        self.waiting: list[Callable[[], None]] = []
-        self.sent: list[str] = []
-
-    def submit(self, do: Callable[[], None]) -> None:
-        self.waiting.append(do)
-
-    def work(self) -> list[str]:
-        while self.waiting:
-            self.waiting.pop(0)()
-        return self.sent
+    def submit(self, do: Callable[..., None], *given: Any) -> "Future[None]":
+        do(*given)
+        done: Future[None] = Future()
+        done.set_result(None)
+        return done
 
 
 def test_buttons_count_when_they_are_pressed_and_stop_wins() -> None:
-    pool = _Pool()
-    buttons = Buttons(Joy(stop_button=1, go_button=0), pool, pool.sent.append)  # type: ignore[arg-type]
-
-    def press(*moments: tuple[int, int]) -> None:
-        for go, stop in moments:
-            buttons(made("sensor_msgs/msg/Joy", buttons=[go, stop]))
-
-    for moment in ((1, 0), (0, 0), (1, 0), (1, 0), (1, 1), (1, 1), (1, 0), (0, 0)):
-        press(moment)
-        pool.work()
+    sent: list[str] = []
+    buttons = Buttons(Joy(stop_button=1, go_button=0), _AtOnce(), sent.append)  # type: ignore[arg-type]
+    for go, stop in ((1, 0), (0, 0), (1, 0), (1, 0), (1, 1), (1, 1), (1, 0), (0, 0)):
+        buttons(made("sensor_msgs/msg/Joy", buttons=[go, stop]))
     # A go that is held at first, or since the stop began, is let go and pressed anew.
-    assert pool.sent == ["go", "stop", "go"]
-    press((0, 1), (0, 0), (1, 0), (0, 0), (0, 1))  # while the answer to the first is awaited
-    assert pool.work()[3:] == ["stop"]
+    assert sent == ["go", "stop", "go"]
+
+
+def test_a_stop_while_a_go_is_not_answered_is_sent_at_once_and_after_it() -> None:
+    """Which of them the car has heard last is not known."""
+    sent: list[str] = []
+
+    def command(action: str) -> None:
+        sent.append(action)
+        if action == "go":
+            buttons(made("sensor_msgs/msg/Joy", buttons=[0, 1]))
+
+    buttons = Buttons(Joy(stop_button=1, go_button=0), _AtOnce(), command)  # type: ignore[arg-type]
+    for go in (0, 1):
+        buttons(made("sensor_msgs/msg/Joy", buttons=[go, 0]))
+    assert sent == ["go", "stop", "stop"]
     with pytest.raises(IndexError):
         buttons(made("sensor_msgs/msg/Joy", buttons=[1]))
 

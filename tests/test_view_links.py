@@ -20,6 +20,7 @@ from msgspec.structs import replace
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
+from bayesrace.errors import InputError
 from bayesrace.log_rotation import RotatingLog
 from bayesrace.messages import Event, Message, Telemetry, encode
 from bayesrace.operation.view import Viewer, run_source
@@ -222,6 +223,16 @@ def test_runs_share_the_rows_that_are_kept(tmp_path: Path, monkeypatch: pytest.M
 
 
 @pytest.mark.skipif(not socket.has_ipv6, reason="needs IPv6")
+def test_a_viewer_that_nobody_can_connect_to_any_more_ends() -> None:
+    """As without descriptors, when its server gives up."""
+    with Viewer(port=0) as viewer:
+        assert viewer.read() == []
+        viewer._server.shutdown()
+        viewer._thread.join(10)
+        with pytest.raises(InputError, match="no page can connect any more"):
+            viewer.read()
+
+
 def test_ipv6_is_served_with_addresses_in_brackets(tmp_path: Path) -> None:
     def asked(host: str, path: str, **headers: str) -> int:
         link = HTTPConnection(host, urlsplit(viewer.address).port, timeout=10)

@@ -228,8 +228,9 @@ static int read_settings(const reader *r, const char *folder, setting *settings,
     int failed = 0;
     while (!failed && fgets(line, sizeof line, file))
         failed = strlen(line) + 1 >= sizeof line ? wrong(r, "has a line that is too long", line)
-                 : !strchr(line, '\n')           ? wrong(r, "is cut off in its line", line)
-                                                 : take_line(r, line, settings, count);
+                 : !strchr(line, '\n')
+                     ? wrong(r, "is cut off in its last line", "export it again, or end that line")
+                     : take_line(r, line, settings, count);
     if (!failed && ferror(file)) failed = wrong(r, "is missing or cannot be read", ANEW);
     fclose(file);
     for (int i = 0; i < count && !failed; ++i)

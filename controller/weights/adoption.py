@@ -96,6 +96,8 @@ class Adopter(Protocol):
     slow: Environment | None
     us: float
     longest_us: float
+    restarted: bool
+    """The history may not be what drives."""
 
     @property
     def unknown_s(self) -> float:
@@ -160,6 +162,8 @@ def ruling_of(number: int, trial: Any, settings: GateSettings, slack: Floats) ->
 class Adoption:
     """Of this process. Holds one task at most: the update manager sets it, the control thread does
     it."""
+
+    restarted = False
 
     def __init__(self, port: StepPort, settings: GateSettings) -> None:
         self._step, self._car, self._settings = port.step, port.car, settings

@@ -209,11 +209,14 @@ class WeightUpdateManager:
             halfway = self.adoption.adopt(proven.packed, proven.version, False, reverted)
         try:
             cycle = self.adoption.adopt(target.packed, target.version, not target.proven, reverted)
-        except InputError:
-            if not target.proven:
-                self._rolled_back(proven, "request", f"{why}; only half the way", halfway)
-                self._keep()
-            raise
+        except InputError as error:
+            if target.proven or self.adoption.restarted:  # what drives now is not known
+                raise
+            self._rolled_back(proven, "request", f"{why}; only half the way", halfway)
+            self._keep()
+            raise InputError(
+                f"{error}; weights {proven.version or 'none'} are in use now"
+            ) from None
         return self._kept(*self._rolled_back(target, "request", why, cycle))
 
     def _kept(self, text: str, data: _Data) -> _Answer:

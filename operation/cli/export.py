@@ -67,7 +67,7 @@ def build(
     if out is not None:
         trusted(out, make=True)  # now, as its loader would refuse it after the work
         if any(out.iterdir()) and not (out / MANIFEST).exists():
-            raise InputError(f"{out} holds other files; give --out a new folder")
+            raise InputError(f"{out} holds other files: give --out a new folder, or delete it")
     target = None if platform is None or board else get_platform(platform)
     own = find_compiler(by_name=True) if board else None  # CC is that of the board
     folder, _ = make(chosen, platform=target, daqp=daqp, compiler=own)

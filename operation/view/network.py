@@ -3,7 +3,7 @@
 import math
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from itertools import count
 from pathlib import Path
 from shutil import rmtree
@@ -28,7 +28,7 @@ _MOST_BYTES: Final = 200_000_000
 _MOST_CARS: Final = 16
 """That are shown, and that are said to be left out."""
 _SILENT_S: Final = 5.0
-"""After that a car that is left out is not there any more."""
+"""After that a car is not there any more."""
 
 
 class AbsentError(InputError):
@@ -54,7 +54,7 @@ class NetworkSource(Source):
         self._numbers, self._heard_s = count(), dict[str, float]()
         self._driven, self._named = driven, False
         self._inbox = Inbox(session, name or None)
-        self._inbox.subscribe(HEARTBEAT, "controller")
+        self._inbox.subscribe(HEARTBEAT)
 
     @property
     def replaced(self) -> bool:
@@ -64,8 +64,9 @@ class NetworkSource(Source):
     def read(self) -> list[Entry[Any]]:
         """The same; cars that have come join before."""
         while (item := self._inbox.get()) is not None:
-            car = item.key.split("/")[1]
-            if item.value is not None and is_car_name(car):
+            _, car, _, source = item.key.split("/")
+            self._heard_s[car] = time.monotonic()
+            if item.value is not None and is_car_name(car) and source == "controller":
                 self.notice(car, item.value.track)
         silent_s = time.monotonic() - _SILENT_S
         for car in [one for one in self.faults if self._heard_s.get(one, math.inf) < silent_s]:
@@ -105,12 +106,13 @@ class NetworkSource(Source):
 
     def _leave(self, car: str) -> None:
         # Of cars that drive, stragglers never end, and nobody waits for theirs.
-        self._recorders.pop(car).close(patience_s=0)
+        with suppress(InputError):  # of a full disk
+            self._recorders.pop(car).close(patience_s=0)
         rmtree(self._readers.pop(car).path.parent)
 
     def _close(self) -> None:
-        for recorder in self._recorders.values():
-            recorder.close(patience_s=0)
+        for car in [*self._recorders]:
+            self._leave(car)
 
     def _leave_out(self, car: str, why: str) -> None:
         if car in self.faults or len(self.faults) < _MOST_CARS:

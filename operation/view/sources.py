@@ -24,7 +24,9 @@ _LOG: Final = "run.mcap"
 _TRACK, _LINE, _CAR = "race.csv", "race_raceline.csv", "car.toml"
 """Of a race, in its folder."""
 _FRESH_S: Final = 3.0
-"""A log that was written to so short a time ago is that of a race that runs."""
+"""A log that was written to so short a time ago is that of a race that runs ..."""
+_APART_S: Final = 60.0
+"""... also by the clock of another machine, whose disk it is on, if that is ahead by less."""
 _AT_ONCE: Final = 4_000
 """Messages of a log that are held at a time."""
 
@@ -124,7 +126,7 @@ def run_source(path: Path, track: str = "", car: str = "") -> Source:
 def race_logs(folder: Path) -> list[Path]:
     """Logs of the races that have left their runs in a folder, the newest last; those of times
     to come, as a clock has it that was set since, are the older the later."""
-    return sorted(folder.glob(f"*/{_LOG}"), key=_age_s, reverse=True)
+    return sorted(folder.glob(f"*/{_LOG}"), key=lambda log: -abs(_age_s(log)))
 
 
 def driven_race(folder: Path, than: Source | None = None) -> Source | None:
@@ -149,11 +151,11 @@ def _identity(log: Path) -> tuple[int, int] | None:
 def _is_written(log: Path) -> bool:
     """Whether a log has been added to just now; of a car in the network, heartbeats are."""
     ages_s = [_age_s(part_path(log, number)) for number in part_files(log)]
-    return min(ages_s, default=math.inf) < _FRESH_S
+    return any(-_APART_S < one < _FRESH_S for one in ages_s)
 
 
 def _age_s(log: Path) -> float:
-    """Since it was added to."""
+    """Since it was added to; negative by a clock that is ahead, or was set back since."""
     with suppress(OSError):
-        return abs(time.time() - log.stat().st_mtime)
+        return time.time() - log.stat().st_mtime
     return math.inf
