@@ -34,7 +34,7 @@ _REMEDIES: Final = {
 _NX: Final = 7
 _ROUNDS: Final = 2
 _LONGEST: Final = 5_000
-"""States that are smoothed at once, which takes some 50 kB for each."""
+"""States that are smoothed at once, which takes some 20 kB for each of their events."""
 _NOISE: Final = 0.65
 """Of the noise that is learned from smoothed states, what is the model's. The rest is what the
 smoothing left unknown, which the next one would only confirm."""
