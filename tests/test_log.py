@@ -366,10 +366,19 @@ def test_a_log_that_cannot_be_written_is_an_event(
     with recorded(path) as (other, publisher, recorder):
         inbox = Inbox(other, "orca")
         inbox.subscribe(EVENT)
+
+        probe = encode(messages.event(source="race"))
+
+        def heard() -> object:
+            recorder._session.put("bayesrace/orca/event/race", probe)
+            return inbox.get(0.1)
+
+        until(heard, "the other hears events of here")
         monkeypatch.setattr(LogWriter, "write", full)
         publisher.put(state(0), lockstep=True)
         until(lambda: recorder.failed, "the failure")
-        item = inbox.get(20.0)
+        while (item := inbox.get(20.0)) is not None and item.value.source == "race":
+            pass
         assert item is not None
         event = item.value
         assert (event.source, event.kind) == ("recorder", "recorder_failed")
