@@ -4,10 +4,10 @@ import math
 import re
 from typing import Any, ClassVar, Final, Literal, Self
 
-import pydantic
-from pydantic import Field, model_validator
+from pydantic import ConfigDict, Field, model_validator
 
 from bayesrace.errors import InputError
+from bayesrace.strict import StrictModel
 
 __all__ = ["Affine", "Section", "factor_of"]
 
@@ -33,12 +33,10 @@ mistake."""
 Sign = Literal[1, -1]
 
 
-class Section(pydantic.BaseModel):
-    """A table of a file that a user writes; unknown keys are refused."""
+class Section(StrictModel):
+    """A table of a file that a user writes."""
 
-    model_config = pydantic.ConfigDict(
-        frozen=True, extra="forbid", allow_inf_nan=False, populate_by_name=True
-    )
+    model_config = ConfigDict(populate_by_name=True)
 
 
 class Affine(Section):

@@ -6,7 +6,7 @@ The two networks have a session each, and nothing is forwarded but what is made 
 import logging
 import time
 from collections.abc import Callable, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from functools import partial
 from typing import Any, Final
 
@@ -82,9 +82,7 @@ def _command(session: Any, name: str, action: str) -> None:
 class Buttons:
     """Turns the pressing of buttons into commands, whose answers ``pool`` waits for. Stop wins."""
 
-    def __init__(
-        self, settings: Joy, pool: ThreadPoolExecutor, command: Callable[[str], None]
-    ) -> None:
+    def __init__(self, settings: Joy, pool: Executor, command: Callable[[str], None]) -> None:
         self._settings, self._pool, self._command = settings, pool, command
         self._stop, self._go = False, True
         """Before the first message: a stop that is held then counts, a go does not."""

@@ -105,7 +105,7 @@ class NetworkSource(Source):
         return True
 
     def _leave(self, car: str) -> None:
-        # Of cars that drive, stragglers never end, and nobody waits for theirs.
+        # A car that drives goes on sending; nobody waits for its last messages.
         with suppress(InputError):  # of a full disk
             self._recorders.pop(car).close(patience_s=0)
         rmtree(self._readers.pop(car).path.parent)
